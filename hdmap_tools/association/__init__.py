@@ -1,0 +1,1 @@
+"""From pixels to cells: which map cell each label of an image speaks about."""

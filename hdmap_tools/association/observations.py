@@ -1,0 +1,49 @@
+"""What one frame saw: the contract between association and fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdmap_tools.errors import ShapeError
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Labelled ground points of one frame (one image).
+
+    Attributes:
+        points_city: (N, 3) float64 metres, city frame: where the ground was seen.
+        labels: (N,) uint8 ids of the segmentation's label set.
+        intensity: (N,) uint8 lidar intensity; None when there is no lidar
+            (all votes then count into the lowest intensity bin).
+    """
+
+    points_city: NDArrayFloat
+    labels: NDArrayByte
+    intensity: NDArrayByte | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.labels)
+        if self.points_city.shape != (count, 3) or self.labels.shape != (count,):
+            raise ShapeError(
+                f"Observations need points (N, 3) and labels (N,), found {self.points_city.shape} "
+                f"and {self.labels.shape}."
+            )
+        if self.labels.dtype != np.uint8:
+            raise ShapeError(f"Labels must be uint8 ids, found {self.labels.dtype}.")
+        if self.intensity is not None and (
+            self.intensity.shape != (count,) or self.intensity.dtype != np.uint8
+        ):
+            raise ShapeError(
+                f"Intensity must be (N,) uint8, found {self.intensity.shape} {self.intensity.dtype}."
+            )
+        if not np.isfinite(self.points_city).all():
+            raise ShapeError(
+                "Observations hold NaN or infinite points; readers and association drop them first."
+            )
+
+    def __len__(self) -> int:
+        return len(self.labels)

@@ -1,0 +1,231 @@
+"""One small typed model a step; `hdmap.yaml` holds them, and each run dumps the ones it used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hdmap_tools.errors import ConfigError
+from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
+
+SCHEMA_VERSION: Final = 1
+"""Version of hdmap.yaml; raised when a field changes its meaning."""
+
+
+class _Step(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DriveConfig(_Step):
+    """Which part of the drive is used.
+
+    Attributes:
+        layout: Reader to use; ``auto`` guesses from the folder.
+        cameras: Camera names; empty means all calibrated ones.
+        max_pose_gap_s: Frames in a longer gap between poses are dropped and counted.
+        max_sweep_gap_s: Largest time between an image and the sweep used with it.
+    """
+
+    layout: str = "auto"
+    cameras: tuple[str, ...] = ()
+    max_pose_gap_s: Annotated[float, Field(gt=0)] = 0.5
+    max_sweep_gap_s: Annotated[float, Field(gt=0)] = 0.1
+
+
+class SegmentationConfig(_Step):
+    """Where labels come from.
+
+    Attributes:
+        model: Path of an ONNX or OpenVINO model; None looks in `models/` in and beside the drive.
+        profile: Name or path of a model profile; None finds it by the model's hash.
+        labels: Folder of label PNGs ``<camera>/<timestamp_ns>.png``, instead of a model.
+        label_set: Label set of those PNGs.
+        threads: CPU threads of the network; 0 is its own choice.
+    """
+
+    model: Path | None = None
+    profile: str | None = None
+    labels: Path | None = None
+    label_set: str | None = None
+    threads: Annotated[int, Field(ge=0)] = 0
+
+
+class AssociationConfig(_Step):
+    """How labels reach the ground.
+
+    Attributes:
+        method: ``sparse`` puts the lidar sweep into the images, ``planar`` puts
+            the labels on a plane through the wheels' contact points.
+        max_range_m: Points further from the ego origin (in x-y) are not used.
+        ground_tolerance_m: How far above or below the estimated ground a point still is ground.
+        occlusion_test: Leave out points that nearer things hide from the camera.
+        planar_ahead_m: Reach of the planar method along the view; labels on a
+            plane spread quickly beyond it.
+    """
+
+    method: Literal["sparse", "planar"] = "sparse"
+    max_range_m: Annotated[float, Field(gt=0)] = 40.0
+    ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.2
+    occlusion_test: bool = True
+    planar_ahead_m: Annotated[float, Field(gt=0)] = 25.0
+
+
+class FusionConfig(_Step):
+    """How frames become counts.
+
+    Attributes:
+        resolution_m: Cell size.
+        count_mode: How a frame votes in a cell: ``majority`` (one vote for the
+            most frequent label), ``share`` (16 quanta shared among the labels
+            seen), ``frame`` (one vote for each label seen), ``point`` (one vote
+            a point).
+        intensity_threshold: k, the intensity 0..255 from which on a return looks
+            like paint; ``auto`` estimates it by Otsu's method on road points.
+        reference_height_m: City height that stored heights count from.
+    """
+
+    resolution_m: Annotated[float, Field(gt=0)] = 0.2
+    count_mode: Literal["majority", "share", "frame", "point"] = "share"
+    intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
+    reference_height_m: float = 0.0
+
+
+class ObservationConfig(_Step):
+    """How counts are read as probabilities.
+
+    Attributes:
+        model: ``vanilla`` believes each label alike; ``confusion`` uses the
+            network's confusion matrix.
+        confusion: Path of a confusion matrix, or None for the one known for the model.
+        intensity: Add the intensity term for lane marks.
+        gamma: Weight of an intensity at or above k, as evidence for lane mark (log-likelihood).
+        vanilla_lambda: λ in M = μ(I + λ1).
+        smoothing: Laplace smoothing: added to each entry of the confusion matrix, as a
+            share of its row.
+        temperature: Divides the evidence; above 1 is more careful.
+        priors: Prior probability by class; missing ones share what is left.
+        fill_radius_cells: Radius of hole filling; 0 turns it off.
+    """
+
+    model: Literal["vanilla", "confusion"] = "confusion"
+    confusion: Path | None = None
+    intensity: bool = False
+    gamma: Annotated[float, Field(ge=0)] = 2.0
+    vanilla_lambda: Annotated[float, Field(gt=0)] = 0.1
+    smoothing: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    temperature: Annotated[float, Field(gt=0)] = 1.0
+    priors: dict[MapClass, float] = Field(default_factory=dict)
+    fill_radius_cells: Annotated[int, Field(ge=0, le=20)] = 1
+
+
+class VectorizeConfig(_Step):
+    """Which plugins run.
+
+    Attributes:
+        vectorizers: Names; empty means all installed ones.
+        options: Options by plugin name.
+        seed: Seed of the generator each plugin is handed.
+    """
+
+    vectorizers: tuple[str, ...] = ()
+    options: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    seed: int = 0
+
+
+class ExportConfig(_Step):
+    """What is written beside the working file.
+
+    Attributes:
+        formats: Export formats.
+        origin: Latitude, longitude and height of the city origin, where the
+            drive does not know it.
+    """
+
+    formats: tuple[Literal["lanelet2", "geojson"], ...] = ("lanelet2",)
+    origin: tuple[float, float, float] | None = None
+
+
+class CompareConfig(_Step):
+    """What the result is held against.
+
+    Attributes:
+        reference: Mask picture with its JSON, or a vector map; None takes what
+            lies with the drive.
+        max_range_m: Only cells this near to the driven path are compared; None is no limit.
+    """
+
+    reference: Path | None = None
+    max_range_m: Annotated[float, Field(gt=0)] | None = 40.0
+
+
+class Config(_Step):
+    """The whole of hdmap.yaml."""
+
+    schema_version: Literal[1] = 1
+    classes: tuple[MapClass, ...] = MAP_CLASSES
+    drive: DriveConfig = DriveConfig()
+    segmentation: SegmentationConfig = SegmentationConfig()
+    association: AssociationConfig = AssociationConfig()
+    fusion: FusionConfig = FusionConfig()
+    observation: ObservationConfig = ObservationConfig()
+    vectorize: VectorizeConfig = VectorizeConfig()
+    export: ExportConfig = ExportConfig()
+    compare: CompareConfig = CompareConfig()
+
+    def to_yaml(self) -> str:
+        """The document that `load_config` reads back."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+
+
+def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
+    """Read hdmap.yaml and put options over it.
+
+    Args:
+        path: The file, or None for the defaults.
+        overrides: Values by dotted name, for example ``{"fusion.resolution_m": 0.1}``;
+            those that are None are left out.
+
+    Raises:
+        ConfigError: If the file is not YAML, or a field is unknown or wrong; the
+            message names each of them.
+    """
+    document: Any = {}
+    if path is not None:
+        try:
+            document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            raise ConfigError(f"No configuration file {path}.") from error
+        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+            raise ConfigError(f"{path} is not readable YAML: {error}") from error
+        document = {} if document is None else document
+        if not isinstance(document, dict):
+            raise ConfigError(
+                f"{path} must hold a mapping of steps, found {type(document).__name__}."
+            )
+        found = document.get("schema_version", SCHEMA_VERSION)
+        if found != SCHEMA_VERSION:
+            raise ConfigError(
+                f"{path} has schema_version {found}; this version reads {SCHEMA_VERSION}. "
+                "Install the matching release, or write the file anew with `hdmap info --config`."
+            )
+    for dotted, value in (overrides or {}).items():
+        if value is None:
+            continue
+        *sections, field = dotted.split(".")
+        target = document
+        for section in sections:
+            target = target.setdefault(section, {})
+            if not isinstance(target, dict):
+                raise ConfigError(f"{path}: {section!r} must be a mapping, found {target!r}.")
+        target[field] = value
+    try:
+        return Config.model_validate(document)
+    except ValidationError as error:
+        lines = [
+            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']} (found {problem['input']!r})"
+            for problem in error.errors()
+        ]
+        raise ConfigError(f"{path or 'configuration'}: " + "; ".join(lines)) from error

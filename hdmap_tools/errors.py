@@ -1,0 +1,110 @@
+"""Every error a caller may want to catch.
+
+    HDMapError
+    ├── ConfigError (ValueError)              hdmap.yaml or an option is wrong
+    ├── ShapeError (ValueError)               an array has the wrong shape or dtype
+    ├── CRSMismatchError (ValueError)         two frames or CRSs were mixed
+    ├── NoOriginError (ValueError)            a geographic export without an origin
+    ├── LabelError (ValueError)               a label id or label set does not fit
+    ├── DriveError (ValueError)               a drive cannot be read
+    │   ├── CalibrationError                  a sensor's calibration is missing or unusable
+    │   ├── PoseError                         no pose at the time needed
+    │   ├── SweepError                        a lidar sweep is truncated or malformed
+    │   └── ImageError                        an image does not decode
+    ├── MapMismatchError (ValueError)         maps of other resolution, mode or labels
+    ├── StoreError (OSError)                  a semantic map's repository cannot be used
+    ├── PluginError (RuntimeError)            a vectorizer cannot be used
+    │   ├── UnknownPluginError (LookupError)  no vectorizer of that name
+    │   ├── PluginVersionError                written for another plugin API
+    │   ├── PluginLoadError                   importing it failed
+    │   └── PluginFailedError                 it raised, or returned what it must not
+    ├── FormatError (ValueError)              a map file cannot be read or written
+    ├── OutputExistsError (FileExistsError)   would overwrite
+    └── MissingExtraError (ImportError)       an optional dependency is not installed
+
+A message says what was found, what was expected and what to do.
+"""
+
+
+class HDMapError(Exception):
+    """Root of all errors raised on purpose by this package."""
+
+
+class ConfigError(HDMapError, ValueError):
+    """A configuration file or an option is wrong."""
+
+
+class ShapeError(HDMapError, ValueError):
+    """An array has the wrong shape or dtype."""
+
+
+class CRSMismatchError(HDMapError, ValueError):
+    """Two different frames or coordinate reference systems were mixed."""
+
+
+class NoOriginError(HDMapError, ValueError):
+    """A geographic result was asked of a frame without an origin."""
+
+
+class LabelError(HDMapError, ValueError):
+    """A label id lies outside its label set, or two label sets do not fit."""
+
+
+class DriveError(HDMapError, ValueError):
+    """A drive cannot be read."""
+
+
+class CalibrationError(DriveError):
+    """A sensor's calibration is missing or unusable."""
+
+
+class PoseError(DriveError):
+    """No usable ego pose at the time needed."""
+
+
+class SweepError(DriveError):
+    """A lidar sweep is truncated or malformed."""
+
+
+class ImageError(DriveError):
+    """A camera or label image cannot be read."""
+
+
+class MapMismatchError(HDMapError, ValueError):
+    """Two maps differ in resolution, count mode, labels or frame."""
+
+
+class StoreError(HDMapError, OSError):
+    """The repository of a semantic map cannot be opened, read or committed to."""
+
+
+class PluginError(HDMapError, RuntimeError):
+    """A vectorizer plugin cannot be used."""
+
+
+class UnknownPluginError(PluginError, LookupError):
+    """No installed vectorizer has the name asked for."""
+
+
+class PluginVersionError(PluginError):
+    """A plugin was written for another major version of the plugin API."""
+
+
+class PluginLoadError(PluginError):
+    """Importing a plugin failed, or what it names is not a vectorizer."""
+
+
+class PluginFailedError(PluginError):
+    """A plugin raised while it ran, or returned what the contract forbids."""
+
+
+class FormatError(HDMapError, ValueError):
+    """A map file cannot be read, or a map cannot be written in that format."""
+
+
+class OutputExistsError(HDMapError, FileExistsError):
+    """The output exists already and was not to be overwritten."""
+
+
+class MissingExtraError(HDMapError, ImportError):
+    """An optional dependency is needed and not installed."""

@@ -1,0 +1,1 @@
+"""Poses, cameras, grids and the map's place on earth."""

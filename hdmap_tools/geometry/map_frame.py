@@ -1,0 +1,167 @@
+"""Where the city frame lies on earth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hdmap_tools.errors import CRSMismatchError, NoOriginError, ShapeError
+from hdmap_tools.types import NDArrayFloat
+
+if TYPE_CHECKING:
+    from pyproj import CRS, Transformer
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """The local metric frame ``city`` (x east, y north, z up) and its place on earth.
+
+    A city point is a point of ``crs`` minus ``offset_m``. Without a CRS the map
+    lives in metres only, and geographic exports raise `NoOriginError`.
+
+    Attributes:
+        crs_wkt: WKT of a projected CRS in metres, or None.
+        offset_m: (x, y, z) of the city origin in that CRS and above the vertical
+            datum, metres.
+        vertical_datum: What heights refer to; ``WGS84`` is the ellipsoid.
+    """
+
+    crs_wkt: str | None = None
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    vertical_datum: str = "WGS84"
+
+    def __post_init__(self) -> None:
+        if len(self.offset_m) != 3 or not np.isfinite(self.offset_m).all():
+            raise ShapeError(f"offset_m must be three finite metres, found {self.offset_m}.")
+        if self.crs_wkt is not None:
+            if not self.crs.is_projected:
+                raise CRSMismatchError(
+                    f"A map frame needs a projected CRS in metres, found {self.crs.name!r} "
+                    f"({self.crs.type_name}); use MapFrame.from_origin for a latitude and longitude."
+                )
+            units = {axis.unit_name for axis in self.crs.axis_info[:2]}
+            if units != {"metre"}:
+                raise CRSMismatchError(
+                    f"A map frame needs a CRS in metres, found {self.crs.name!r} in {sorted(units)}."
+                )
+
+    @classmethod
+    def from_origin(
+        cls, lat_deg: float, lon_deg: float, alt_m: float = 0.0, vertical_datum: str = "WGS84"
+    ) -> MapFrame:
+        """A transverse Mercator with scale 1 on the origin, which becomes city (0, 0, 0)."""
+        from pyproj import CRS
+
+        if not (-85.0 <= lat_deg <= 85.0 and -180.0 <= lon_deg <= 180.0):
+            raise NoOriginError(
+                f"Origin latitude {lat_deg}, longitude {lon_deg} is not usable: expected latitude "
+                "-85..85 and longitude -180..180 degrees, in this order."
+            )
+        crs = CRS.from_proj4(
+            f"+proj=tmerc +lat_0={lat_deg!r} +lon_0={lon_deg!r} +k=1 +x_0=0 +y_0=0 "
+            "+datum=WGS84 +units=m +no_defs"
+        )
+        return cls(crs.to_wkt(), (0.0, 0.0, float(alt_m)), vertical_datum)
+
+    @classmethod
+    def from_crs(
+        cls, crs: Any, origin_lat_lon: tuple[float, float] | None = None, alt_m: float = 0.0
+    ) -> MapFrame:
+        """Any projected CRS of pyproj; the city origin is put at a latitude and longitude."""
+        from pyproj import CRS
+
+        wkt = CRS.from_user_input(crs).to_wkt()
+        if origin_lat_lon is None:
+            return cls(wkt, (0.0, 0.0, alt_m))
+        x, y = cls(wkt)._from_wgs84.transform(origin_lat_lon[1], origin_lat_lon[0])
+        return cls(wkt, (float(x), float(y), alt_m))
+
+    @classmethod
+    def from_json(cls, document: dict[str, Any]) -> MapFrame:
+        """From what `to_json` gave."""
+        offset = document["offset_m"]
+        return cls(
+            document["crs_wkt"],
+            (float(offset[0]), float(offset[1]), float(offset[2])),
+            document["vertical_datum"],
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """A plain document that `from_json` reads back."""
+        return {
+            "crs_wkt": self.crs_wkt,
+            "offset_m": list(self.offset_m),
+            "vertical_datum": self.vertical_datum,
+        }
+
+    @cached_property
+    def crs(self) -> CRS:
+        """The projected CRS.
+
+        Raises:
+            NoOriginError: If the frame has none.
+        """
+        from pyproj import CRS
+
+        if self.crs_wkt is None:
+            raise NoOriginError(
+                "The map has no origin on earth, so it cannot be written in a geographic format; "
+                "give one with --origin LAT,LON[,ALT]."
+            )
+        return CRS.from_wkt(self.crs_wkt)
+
+    @property
+    def is_georeferenced(self) -> bool:
+        """Whether the frame's place on earth is known."""
+        return self.crs_wkt is not None
+
+    @cached_property
+    def _to_wgs84(self) -> Transformer:
+        from pyproj import Transformer
+
+        return Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+
+    @cached_property
+    def _from_wgs84(self) -> Transformer:
+        from pyproj import Transformer
+
+        return Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
+
+    def to_wgs84(self, points_city: NDArrayFloat) -> NDArrayFloat:
+        """City points (N, 3), metres, to (N, 3) longitude, latitude (degrees) and height (metres)."""
+        points = _checked(points_city) + self.offset_m
+        lon, lat = self._to_wgs84.transform(points[:, 0], points[:, 1])
+        return np.column_stack([lon, lat, points[:, 2]])
+
+    def from_wgs84(self, lon_lat_height: NDArrayFloat) -> NDArrayFloat:
+        """Longitude, latitude (degrees) and height (metres), (N, 3), to city points (N, 3)."""
+        geographic = _checked(lon_lat_height)
+        x, y = self._from_wgs84.transform(geographic[:, 0], geographic[:, 1])
+        return np.column_stack([x, y, geographic[:, 2]]) - self.offset_m
+
+    def require_same(self, other: MapFrame) -> None:
+        """Raise `CRSMismatchError` unless the other frame is this one."""
+        same_crs = self.crs_wkt == other.crs_wkt or (
+            self.crs_wkt is not None and other.crs_wkt is not None and self.crs == other.crs
+        )
+        if not same_crs or not np.allclose(self.offset_m, other.offset_m, rtol=0, atol=1e-6):
+            raise CRSMismatchError(
+                f"Two frames were mixed: {self.describe()} and {other.describe()}."
+            )
+
+    def describe(self) -> str:
+        """One line for people."""
+        if self.crs_wkt is None:
+            return "local metres without an origin"
+        x, y, z = self.offset_m
+        return f"{self.crs.name} with city origin at ({x:.3f}, {y:.3f}, {z:.3f})"
+
+
+def _checked(points: NDArrayFloat) -> NDArrayFloat:
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ShapeError(f"Points must be (N, 3), found {points.shape}.")
+    return points

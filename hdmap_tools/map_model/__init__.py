@@ -1,0 +1,1 @@
+"""The vector map: typed elements in one city frame."""

@@ -1,0 +1,1 @@
+"""Drives on disk: one module a layout, all giving the same `Drive`."""

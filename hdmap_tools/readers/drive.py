@@ -1,0 +1,133 @@
+"""A drive: cameras, lidar sweeps and ego poses over time, read lazily."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hdmap_tools.errors import DriveError, ShapeError
+from hdmap_tools.geometry.camera import PinholeCamera
+from hdmap_tools.geometry.map_frame import MapFrame
+from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """One turn of the lidar.
+
+    Attributes:
+        timestamp_ns: Time of the ego pose that the points refer to.
+        points_ego: (N, 3) float64 metres, ego frame at timestamp_ns, finite, and
+            ego-motion compensated where the data gives a time for each point.
+        intensity: (N,) uint8, 0..255 as the sensor gives it.
+        ring: (N,) uint8 laser number; zeros when unknown.
+    """
+
+    timestamp_ns: int
+    points_ego: NDArrayFloat
+    intensity: NDArrayByte
+    ring: NDArrayByte
+
+    def __post_init__(self) -> None:
+        count = len(self.points_ego)
+        if (
+            self.points_ego.shape != (count, 3)
+            or self.intensity.shape != (count,)
+            or self.ring.shape != (count,)
+        ):
+            raise ShapeError(
+                f"A sweep needs points (N, 3), intensity (N,) and ring (N,), found "
+                f"{self.points_ego.shape}, {self.intensity.shape}, {self.ring.shape}."
+            )
+
+
+@dataclass(frozen=True)
+class SweepRef:
+    """Where a sweep lies; `Drive.read_sweep` reads it."""
+
+    timestamp_ns: int
+    path: Path
+    sensor: str
+
+
+@dataclass(frozen=True)
+class ImageRef:
+    """Where an image lies and when it was taken; `read_image` reads it."""
+
+    camera: str
+    timestamp_ns: int
+    path: Path
+
+    @property
+    def key(self) -> str:
+        """``<camera>/<timestamp_ns>``: names its label image in caches and label folders."""
+        return f"{self.camera}/{self.timestamp_ns}"
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One recorded or simulated drive.
+
+    Attributes:
+        name: Log or scene name; with `layout` it identifies the drive in a map's history.
+        layout: Name of the reader, for example ``nuscenes`` or ``av2``.
+        root: Folder it was read from.
+        frame: The city frame of the poses.
+        trajectory: ``city_SE3_ego`` over time.
+        cameras: Calibrated cameras by name; only those that can be used.
+        images: All images of those cameras, by time.
+        sweeps: All lidar sweeps, by time.
+        reference_maps: Existing maps of the place that lie in the drive's folder.
+        warnings: What was left out while listing, one line each.
+        read_sweep: Reads one sweep, ego-motion compensated.
+    """
+
+    name: str
+    layout: str
+    root: Path
+    frame: MapFrame
+    trajectory: Trajectory
+    cameras: Mapping[str, PinholeCamera]
+    images: tuple[ImageRef, ...]
+    sweeps: tuple[SweepRef, ...]
+    read_sweep: Callable[[SweepRef], Sweep] = field(repr=False)
+    reference_maps: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        unknown = sorted({image.camera for image in self.images} - set(self.cameras))
+        if unknown:
+            raise DriveError(
+                f"Drive {self.name}: images of uncalibrated cameras {', '.join(unknown)}."
+            )
+        object.__setattr__(
+            self, "images", tuple(sorted(self.images, key=lambda i: (i.timestamp_ns, i.camera)))
+        )
+        object.__setattr__(self, "sweeps", tuple(sorted(self.sweeps, key=lambda s: s.timestamp_ns)))
+
+    @property
+    def id(self) -> str:
+        """``<layout>:<name>``."""
+        return f"{self.layout}:{self.name}"
+
+    def nearest_sweep(self, timestamp_ns: int, max_gap_s: float) -> SweepRef | None:
+        """The sweep nearest in time, or None when all are further away than max_gap_s."""
+        if not self.sweeps:
+            return None
+        times = np.array([s.timestamp_ns for s in self.sweeps], dtype=np.int64)
+        index = int(np.argmin(np.abs(times - timestamp_ns)))
+        return (
+            self.sweeps[index] if abs(int(times[index]) - timestamp_ns) <= max_gap_s * 1e9 else None
+        )
+
+
+def keep_finite(
+    points: NDArrayFloat, *columns: NDArrayByte
+) -> tuple[NDArrayFloat, list[NDArrayByte], int]:
+    """Drop rows with NaN or infinite coordinates; also says how many were dropped."""
+    finite = np.isfinite(points).all(axis=1)
+    return points[finite], [column[finite] for column in columns], int((~finite).sum())
