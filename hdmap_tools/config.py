@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
@@ -16,7 +17,7 @@ SCHEMA_VERSION: Final = 1
 
 
 class _Step(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class DriveConfig(_Step):
@@ -100,6 +101,8 @@ class ObservationConfig(_Step):
         model: ``vanilla`` believes each label alike; ``confusion`` uses the
             network's confusion matrix.
         confusion: Path of a confusion matrix, or None for the one known for the model.
+        other: Let cells also be none of the map's classes (buildings, vehicles). The
+            paper does without; then such cells go to the class least unlikely.
         intensity: Add the intensity term for lane marks.
         gamma: Weight of an intensity at or above k, as evidence for lane mark (log-likelihood).
         vanilla_lambda: λ in M = μ(I + λ1).
@@ -112,12 +115,13 @@ class ObservationConfig(_Step):
 
     model: Literal["vanilla", "confusion"] = "confusion"
     confusion: Path | None = None
+    other: bool = True
     intensity: bool = False
     gamma: Annotated[float, Field(ge=0)] = 2.0
     vanilla_lambda: Annotated[float, Field(gt=0)] = 0.1
     smoothing: Annotated[float, Field(gt=0, lt=1)] = 0.01
     temperature: Annotated[float, Field(gt=0)] = 1.0
-    priors: dict[MapClass, float] = Field(default_factory=dict)
+    priors: dict[MapClass, Annotated[float, Field(ge=0, le=1)]] = Field(default_factory=dict)
     fill_radius_cells: Annotated[int, Field(ge=0, le=20)] = 1
 
 
@@ -165,7 +169,7 @@ class Config(_Step):
     """The whole of hdmap.yaml."""
 
     schema_version: Literal[1] = 1
-    classes: tuple[MapClass, ...] = MAP_CLASSES
+    classes: Annotated[tuple[MapClass, ...], Field(min_length=1)] = MAP_CLASSES
     drive: DriveConfig = DriveConfig()
     segmentation: SegmentationConfig = SegmentationConfig()
     association: AssociationConfig = AssociationConfig()
@@ -174,6 +178,13 @@ class Config(_Step):
     vectorize: VectorizeConfig = VectorizeConfig()
     export: ExportConfig = ExportConfig()
     compare: CompareConfig = CompareConfig()
+
+    @field_validator("classes")
+    @classmethod
+    def _classes_differ(cls, classes: tuple[MapClass, ...]) -> tuple[MapClass, ...]:
+        if len(set(classes)) != len(classes):
+            raise ValueError("a class is named twice")
+        return classes
 
     def to_yaml(self) -> str:
         """The document that `load_config` reads back."""
@@ -208,7 +219,7 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
         found = document.get("schema_version", SCHEMA_VERSION)
         if found != SCHEMA_VERSION:
             raise ConfigError(
-                f"{path} has schema_version {found}; this version reads {SCHEMA_VERSION}. "
+                f"{path} has schema_version {_short(found)}; this version reads {SCHEMA_VERSION}. "
                 "Install the matching release, or write the file anew with `hdmap info --config`."
             )
     for dotted, value in (overrides or {}).items():
@@ -219,13 +230,18 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
         for section in sections:
             target = target.setdefault(section, {})
             if not isinstance(target, dict):
-                raise ConfigError(f"{path}: {section!r} must be a mapping, found {target!r}.")
+                raise ConfigError(f"{path}: {section!r} must be a mapping, found {_short(target)}.")
         target[field] = value
     try:
         return Config.model_validate(document)
     except ValidationError as error:
         lines = [
-            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']} (found {problem['input']!r})"
+            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']} (found {_short(problem['input'])})"
             for problem in error.errors()
         ]
         raise ConfigError(f"{path or 'configuration'}: " + "; ".join(lines)) from error
+
+
+def _short(value: Any) -> str:
+    # A few lines of YAML aliases can stand for gigabytes of text.
+    return reprlib.repr(value)

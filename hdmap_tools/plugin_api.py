@@ -99,7 +99,8 @@ class MapWindow:
 
     Attributes:
         dataset: ``posterior (class, y, x)`` float32, sums to 1 over class where
-            there is evidence and is NaN where there is none; ``entropy (y, x)``
+            there is evidence and is NaN where there is none; beside the map's
+            classes there may be a last class ``other``, none of them; ``entropy (y, x)``
             float32 in nats; ``observations (y, x)`` float32, votes per cell (0:
             filled from neighbours or unknown); ``intensity (y, x)`` float32 mean
             lidar intensity 0..255, NaN where none; ``height (y, x)`` float32 mean
@@ -140,7 +141,8 @@ class MapWindow:
         posterior = self.dataset["posterior"].values
         if not rows:
             return np.zeros(self.grid.shape, dtype=np.float32)
-        return np.nan_to_num(posterior[rows].sum(axis=0), nan=0.0).astype(np.float32)
+        summed = np.nan_to_num(posterior[rows].sum(axis=0), nan=0.0)
+        return np.asarray(summed, dtype=np.float32)
 
     def layer(self, name: str) -> NDArrayFloat32:
         """(y, x) of ``entropy``, ``observations``, ``intensity`` or ``height``."""

@@ -1,0 +1,1 @@
+"""From observations to the probabilistic map: integer counts, and how they are read."""

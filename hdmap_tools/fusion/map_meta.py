@@ -1,0 +1,86 @@
+"""What the counts of a semantic map mean; stored with it and checked before two maps are added."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hdmap_tools.errors import MapMismatchError
+from hdmap_tools.fusion.voting import CountMode, quanta_per_vote
+from hdmap_tools.geometry.map_frame import MapFrame
+from hdmap_tools.labels.label_set import LabelSet
+
+MAP_SCHEMA_VERSION: Final = 1
+
+
+class MapMeta(BaseModel):
+    """Resolution, frame, labels and count mode of a semantic map.
+
+    Attributes:
+        resolution_m: Cell size, metres.
+        label_set: What was counted: all the network's labels.
+        count_mode: How a frame votes in a cell.
+        intensity_threshold: k; counts in bin 1 had intensity k or above, 0..255.
+        reference_height_m: City height from which stored heights count.
+        frame_document: The city frame (`MapFrame.to_json`).
+        model: Name of the segmentation model; finds its confusion matrix on reading.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_version: Literal[1] = MAP_SCHEMA_VERSION
+    resolution_m: Annotated[float, Field(gt=0)]
+    label_set: LabelSet
+    count_mode: CountMode
+    intensity_threshold: Annotated[int, Field(ge=1, le=255)]
+    reference_height_m: float = 0.0
+    frame_document: dict[str, Any] = Field(default_factory=lambda: MapFrame().to_json())
+    model: str = ""
+
+    @model_validator(mode="after")
+    def _reference_is_whole_millimetres(self) -> MapMeta:
+        # Otherwise changing the reference of a merged map would not be exact.
+        if abs(self.reference_height_m * 1000 - round(self.reference_height_m * 1000)) > 1e-6:
+            raise ValueError("reference_height_m must be a whole number of millimetres")
+        return self
+
+    @property
+    def frame(self) -> MapFrame:
+        """The city frame."""
+        return MapFrame.from_json(self.frame_document)
+
+    @property
+    def num_bins(self) -> int:
+        """Intensity bins: below k, and k or above."""
+        return 2
+
+    @property
+    def quanta_per_vote(self) -> int:
+        """Counts that one frame's vote is worth."""
+        return quanta_per_vote(self.count_mode)
+
+    def require_compatible(self, other: MapMeta) -> None:
+        """Raise unless counts of both maps may be added; the reference height may differ.
+
+        Raises:
+            MapMismatchError: Naming each field that differs, with both values.
+            CRSMismatchError: If the frames differ.
+        """
+        mine = {"label_set": self.label_set.name} | self.model_dump(
+            include={"resolution_m", "count_mode", "intensity_threshold", "model"}
+        )
+        theirs = {"label_set": other.label_set.name} | other.model_dump(
+            include={"resolution_m", "count_mode", "intensity_threshold", "model"}
+        )
+        differing = [
+            f"{key} {mine[key]!r} and {theirs[key]!r}" for key in mine if mine[key] != theirs[key]
+        ]
+        if not differing and self.label_set != other.label_set:
+            differing = [f"label set {self.label_set.name!r} with different labels"]
+        if differing:
+            raise MapMismatchError(
+                f"The maps cannot be added, they differ in {'; '.join(differing)}. Build both with "
+                "the same settings (hdmap.yaml: fusion, segmentation)."
+            )
+        self.frame.require_same(other.frame)

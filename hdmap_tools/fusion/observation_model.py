@@ -1,0 +1,179 @@
+"""How counts become probabilities; applied on reading, so a new model needs no rebuild.
+
+    log P(S=c | z, I) = log prior(c) + (sum_l N[l] log M[c, l] + gamma N_high [c = lane mark]) / (w T) - log Z
+
+with N the counts, w the counts that one frame's vote is worth and T the
+temperature. Source: Paz et al. 2020, equations 3 to 8, written over counts.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hdmap_tools.config import ObservationConfig
+from hdmap_tools.errors import ConfigError, LabelError
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.labels.label_set import LabelSet, MapClass
+from hdmap_tools.segmentation.confusion import ConfusionMatrix
+from hdmap_tools.types import NDArrayAny, NDArrayFloat
+
+_LOG = logging.getLogger(__name__)
+
+OTHER: Final = "other"
+"""The name of "none of the map's classes": buildings, vehicles, water, rails."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationModel:
+    """Log-likelihood of each kind of vote under each class.
+
+    Attributes:
+        classes: Names; `OTHER` last where it is part of the model.
+        log_likelihood: (class, label, bin) natural logarithm of P(label | class),
+            with the intensity term added in the high bin. Finite.
+        log_prior: (class,) natural logarithm of the prior; minus infinity for a
+            class that the labels cannot tell (no label, no measured row).
+        votes_per_count: 1 / (w T).
+    """
+
+    classes: tuple[str, ...]
+    log_likelihood: NDArrayFloat
+    log_prior: NDArrayFloat
+    votes_per_count: float
+
+    def posterior(self, counts: NDArrayAny) -> NDArrayFloat:
+        """Class probabilities from counts.
+
+        Args:
+            counts: (label, bin, y, x) of any real dtype.
+
+        Returns:
+            (class, y, x) float64; sums to 1 over class, NaN where all counts are 0.
+        """
+        labels, bins, rows, cols = counts.shape
+        evidence = self.log_likelihood.reshape(len(self.classes), -1) @ counts.reshape(
+            labels * bins, rows * cols
+        ).astype(np.float64)
+        log_posterior = self.log_prior[:, None] + evidence * self.votes_per_count
+        log_posterior -= log_posterior.max(axis=0)
+        posterior = np.exp(log_posterior)
+        posterior /= posterior.sum(axis=0)
+        posterior[:, ~(counts.reshape(labels * bins, -1) > 0).any(axis=0)] = np.nan
+        return posterior.reshape(len(self.classes), rows, cols)
+
+
+def observation_model(
+    config: ObservationConfig,
+    meta: MapMeta,
+    classes: tuple[MapClass, ...],
+    confusion: ConfusionMatrix | None,
+) -> ObservationModel:
+    """Make the model that a configuration asks for, for a map's label set.
+
+    Raises:
+        ConfigError: If a confusion matrix is asked for and there is none, or the
+            priors are not probabilities.
+        LabelError: If the confusion matrix is for another label set.
+    """
+    names = (*(str(c) for c in classes), *((OTHER,) if config.other else ()))
+    if config.model == "vanilla":
+        likelihood, can_tell = vanilla_likelihood(meta.label_set, names, config.vanilla_lambda)
+    else:
+        if confusion is None:
+            raise ConfigError(
+                f"Observation model 'confusion' needs the confusion matrix of model {meta.model!r}, and "
+                "none is known. Measure one with `hdmap confusion` and give it with --confusion, or use "
+                "observation.model: vanilla."
+            )
+        if confusion.predicted_set.names != meta.label_set.names:
+            raise LabelError(
+                f"The confusion matrix predicts {confusion.predicted_set.name!r} "
+                f"({', '.join(confusion.predicted_set.names)}), but the map counted "
+                f"{meta.label_set.name!r} ({', '.join(meta.label_set.names)})."
+            )
+        likelihood, can_tell = confusion_likelihood(confusion, names, config.smoothing)
+    untold = [name for name, told in zip(names, can_tell, strict=True) if not told and name != OTHER]
+    if untold:
+        _LOG.info(
+            "The labels of %s cannot tell %s; the map gives them probability 0.",
+            meta.label_set.name,
+            " or ".join(untold),
+        )
+    log_likelihood = np.repeat(np.log(likelihood)[:, :, None], meta.num_bins, axis=2)
+    if config.intensity and MapClass.LANE_MARK in names:
+        log_likelihood[names.index(MapClass.LANE_MARK), :, 1] += config.gamma
+    return ObservationModel(
+        names,
+        log_likelihood,
+        _log_prior(config.priors, names, can_tell),
+        1.0 / (meta.quanta_per_vote * config.temperature),
+    )
+
+
+def vanilla_likelihood(
+    label_set: LabelSet, names: tuple[str, ...], lam: float
+) -> tuple[NDArrayFloat, list[bool]]:
+    """M = mu (I + lambda 1), rectangular: each label stands for its class, or for `OTHER`.
+
+    Returns:
+        (class, label) rows that sum to 1, and which classes have a label.
+    """
+    matrix = np.full((len(names), len(label_set)), lam)
+    for label in label_set.labels:
+        name = str(label.map_class) if label.map_class is not None else OTHER
+        if name in names:
+            matrix[names.index(name), label.id] += 1.0
+    can_tell = [bool((row > lam).any()) for row in matrix]
+    return matrix / matrix.sum(axis=1, keepdims=True), can_tell
+
+
+def confusion_likelihood(
+    confusion: ConfusionMatrix, names: tuple[str, ...], smoothing: float
+) -> tuple[NDArrayFloat, list[bool]]:
+    """P(predicted | true class) from a measured matrix, smoothed so that no entry is 0.
+
+    Rows of true labels that are one class of the map are added before they are
+    normalized. Smoothing adds the share ``smoothing`` of a row, spread evenly.
+
+    Returns:
+        (class, label) rows that sum to 1, and which classes have a measured row.
+    """
+    rows = []
+    for name in names:
+        members = [
+            label.id
+            for label in confusion.true_set.labels
+            if (OTHER if label.map_class is None else str(label.map_class)) == name
+        ]
+        rows.append(confusion.counts[members].sum(axis=0).astype(np.float64))
+    counts = np.array(rows)
+    totals = counts.sum(axis=1, keepdims=True)
+    can_tell = [bool(total > 0) for total in totals[:, 0]]
+    normalized = np.where(totals > 0, counts / np.maximum(totals, 1.0), 1.0 / counts.shape[1])
+    return (1.0 - smoothing) * normalized + smoothing / counts.shape[1], can_tell
+
+
+def _log_prior(
+    priors: dict[MapClass, float], names: tuple[str, ...], can_tell: list[bool]
+) -> NDArrayFloat:
+    given = {str(c): p for c, p in priors.items() if str(c) in names}
+    if any(not 0.0 <= p <= 1.0 for p in given.values()) or sum(given.values()) > 1.0 + 1e-9:
+        raise ConfigError(
+            f"observation.priors must be probabilities that sum to at most 1, found {given}."
+        )
+    open_names = [n for n, told in zip(names, can_tell, strict=True) if told and n not in given]
+    rest = max(1.0 - sum(given.values()), 0.0) / max(len(open_names), 1)
+    prior = np.array(
+        [
+            given.get(name, rest) if told else 0.0
+            for name, told in zip(names, can_tell, strict=True)
+        ]
+    )
+    if prior.sum() <= 0.0:
+        raise ConfigError("No class is left with a prior above 0; check observation.priors.")
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(prior / prior.sum()))
