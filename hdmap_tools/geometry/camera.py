@@ -21,7 +21,8 @@ class Projection:
 
     Attributes:
         uv: (N, 2) pixels, u right, v down; the centre of the first pixel is (0, 0).
-            NaN where the point is behind the camera.
+            NaN where the camera model gives none: behind the camera, or at an
+            angle beyond the one for which the distortion model holds.
         depth_m: (N,) along the optical axis, metres.
         is_valid: (N,) bool: in front of the camera, inside the image, and within
             the angle for which the distortion model holds.
@@ -89,7 +90,11 @@ class PinholeCamera:
         Points behind the camera or outside the image stay in the result and are
         marked invalid, so rows keep matching the input.
         """
-        points_cam = self.ego_SE3_cam.inverse().transform_from(points_ego)
+        # Infinite and NaN points are let through as invalid rows, without warnings.
+        with np.errstate(invalid="ignore", over="ignore"):
+            return self._project(self.ego_SE3_cam.inverse().transform_from(points_ego))
+
+    def _project(self, points_cam: NDArrayFloat) -> Projection:
         depth_m = points_cam[:, 2]
         in_front = np.isfinite(points_cam).all(axis=1) & (depth_m > MIN_DEPTH_M)
         safe_depth = np.where(in_front, depth_m, 1.0)
@@ -101,25 +106,25 @@ class PinholeCamera:
         if self.is_distorted:
             xy = _distort(xy, self.distortion)
         uv = xy * (self.fx, self.fy) + (self.cx, self.cy)
-        uv = np.where(in_front[:, None], uv, np.nan)
+        uv = np.where((in_front & in_model)[:, None], uv, np.nan)
         is_valid = in_front & in_model
-        with np.errstate(invalid="ignore"):
-            is_valid &= (uv[:, 0] >= -0.5) & (uv[:, 0] < self.width_px - 0.5)
-            is_valid &= (uv[:, 1] >= -0.5) & (uv[:, 1] < self.height_px - 0.5)
+        is_valid &= (uv[:, 0] >= -0.5) & (uv[:, 0] < self.width_px - 0.5)
+        is_valid &= (uv[:, 1] >= -0.5) & (uv[:, 1] < self.height_px - 0.5)
         return Projection(uv, depth_m, is_valid)
 
     def rays_ego(self, uv: NDArrayFloat) -> NDArrayFloat:
         """Viewing directions (N, 3) in the ego frame of pixels uv (N, 2).
 
         Directions have length one along the optical axis, not unit length: the
-        point at depth d is ``ego_SE3_cam.translation + d * ray``.
+        point at depth d is ``ego_SE3_cam.translation + d * ray``. NaN for pixels
+        that the lens model reaches from nowhere (far outside a wide-angle image).
         """
         uv = np.asarray(uv, dtype=np.float64)
         if uv.ndim != 2 or uv.shape[1] != 2:
             raise ShapeError(f"Pixels must be (N, 2), found {uv.shape}.")
         xy = (uv - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.is_distorted:
-            xy = _undistort(xy, self.distortion)
+            xy = _undistort(xy, self.distortion, self._max_radius)
         rays_cam = np.column_stack([xy, np.ones(len(xy))])
         return rays_cam @ self.ego_SE3_cam.rotation.T
 
@@ -153,11 +158,13 @@ def _distort(xy: NDArrayFloat, distortion: tuple[float, ...]) -> NDArrayFloat:
     )
 
 
-def _undistort(xy_distorted: NDArrayFloat, distortion: tuple[float, ...]) -> NDArrayFloat:
-    """Invert `_distort` by Newton's method with a numerical Jacobian."""
+def _undistort(
+    xy_distorted: NDArrayFloat, distortion: tuple[float, ...], max_radius: float
+) -> NDArrayFloat:
+    """Invert `_distort` by Newton's method with a numerical Jacobian; NaN where it has no inverse."""
     xy = xy_distorted.copy()
     step = 1e-6
-    for _ in range(20):
+    for _ in range(50):
         error = _distort(xy, distortion) - xy_distorted
         if np.abs(error).max(initial=0.0) < 1e-12:
             break
@@ -175,7 +182,9 @@ def _undistort(xy_distorted: NDArrayFloat, distortion: tuple[float, ...]) -> NDA
                 (dx[:, 0] * error[:, 1] - dx[:, 1] * error[:, 0]) / det,
             ]
         )
-    return xy
+    reached = np.abs(_distort(xy, distortion) - xy_distorted).max(axis=1, initial=0.0) < 1e-9
+    reached &= (xy**2).sum(axis=1) <= max_radius**2 * (1 + 1e-9)
+    return np.where(reached[:, None], xy, np.nan)
 
 
 def _monotone_radius(distortion: tuple[float, ...]) -> float:

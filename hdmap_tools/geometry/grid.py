@@ -10,7 +10,7 @@ import numpy as np
 
 from hdmap_tools.errors import MapMismatchError, ShapeError
 from hdmap_tools.geometry.map_frame import MapFrame
-from hdmap_tools.types import NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,21 @@ class BevGrid:
         frame: MapFrame | None = None,
     ) -> BevGrid:
         """The smallest grid that covers (x0, y0, x1, y1) in city metres."""
+        if not (math.isfinite(resolution_m) and resolution_m > 0):
+            raise ShapeError(f"Grid resolution must be positive metres, found {resolution_m}.")
+        if not all(math.isfinite(b) for b in bounds_m):
+            raise ShapeError(f"Grid bounds must be finite city metres, found {tuple(bounds_m)}.")
         x0, y0, x1, y1 = (b / resolution_m for b in bounds_m)
         # A bound that is a whole number of cells but for rounding stays that number.
-        first = lambda v: math.floor(v + 1e-9)  # noqa: E731
-        last = lambda v: math.ceil(v - 1e-9)  # noqa: E731
-        return cls(resolution_m, first(x0), first(y0), last(x1), last(y1), frame or MapFrame())
+        slack = 1e-9
+        return cls(
+            resolution_m,
+            math.floor(x0 + slack),
+            math.floor(y0 + slack),
+            math.ceil(x1 - slack),
+            math.ceil(y1 - slack),
+            frame or MapFrame(),
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -72,12 +82,12 @@ class BevGrid:
     @property
     def x_centres_m(self) -> NDArrayFloat:
         """City x of the cell centres of each column, metres."""
-        return (np.arange(self.x_min, self.x_max) + 0.5) * self.resolution_m
+        return (np.arange(self.x_min, self.x_max, dtype=np.float64) + 0.5) * self.resolution_m
 
     @property
     def y_centres_m(self) -> NDArrayFloat:
         """City y of the cell centres of each row, metres, south to north."""
-        return (np.arange(self.y_min, self.y_max) + 0.5) * self.resolution_m
+        return (np.arange(self.y_min, self.y_max, dtype=np.float64) + 0.5) * self.resolution_m
 
     def cells_of(self, xy_city: NDArrayFloat) -> NDArrayInt:
         """Lattice cells (N, 2) as (ix, iy) of city points (N, 2) or (N, 3); floor, not truncation."""
@@ -88,10 +98,10 @@ class BevGrid:
         cells = self.cells_of(xy_city)
         return np.column_stack([cells[:, 1] - self.y_min, cells[:, 0] - self.x_min])
 
-    def contains(self, rows_cols: NDArrayInt) -> Any:
+    def contains(self, rows_cols: NDArrayInt) -> NDArrayBool:
         """(N,) bool: which array positions lie inside."""
         rows, cols = self.shape
-        return (
+        return np.asarray(
             (rows_cols[:, 0] >= 0)
             & (rows_cols[:, 0] < rows)
             & (rows_cols[:, 1] >= 0)

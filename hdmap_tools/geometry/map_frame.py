@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hdmap_tools.errors import CRSMismatchError, NoOriginError, ShapeError
+from hdmap_tools.errors import CRSMismatchError, FormatError, NoOriginError, ShapeError
 from hdmap_tools.types import NDArrayFloat
 
 if TYPE_CHECKING:
@@ -72,8 +73,14 @@ class MapFrame:
     ) -> MapFrame:
         """Any projected CRS of pyproj; the city origin is put at a latitude and longitude."""
         from pyproj import CRS
+        from pyproj.exceptions import CRSError
 
-        wkt = CRS.from_user_input(crs).to_wkt()
+        try:
+            wkt = CRS.from_user_input(crs).to_wkt()
+        except CRSError as error:
+            raise CRSMismatchError(
+                f"{crs!r} is no coordinate reference system that pyproj knows: {error}"
+            ) from error
         if origin_lat_lon is None:
             return cls(wkt, (0.0, 0.0, alt_m))
         x, y = cls(wkt)._from_wgs84.transform(origin_lat_lon[1], origin_lat_lon[0])
@@ -82,12 +89,16 @@ class MapFrame:
     @classmethod
     def from_json(cls, document: dict[str, Any]) -> MapFrame:
         """From what `to_json` gave."""
-        offset = document["offset_m"]
-        return cls(
-            document["crs_wkt"],
-            (float(offset[0]), float(offset[1]), float(offset[2])),
-            document["vertical_datum"],
-        )
+        try:
+            x, y, z = document["offset_m"]
+            wkt, datum = document["crs_wkt"], document["vertical_datum"]
+            offset_m = float(x), float(y), float(z)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FormatError(
+                "A map frame needs crs_wkt, offset_m (three metres) and vertical_datum, found "
+                f"{reprlib.repr(document)}."
+            ) from error
+        return cls(wkt, offset_m, datum)
 
     def to_json(self) -> dict[str, Any]:
         """A plain document that `from_json` reads back."""
@@ -103,15 +114,22 @@ class MapFrame:
 
         Raises:
             NoOriginError: If the frame has none.
+            CRSMismatchError: If its WKT cannot be read.
         """
         from pyproj import CRS
+        from pyproj.exceptions import CRSError
 
         if self.crs_wkt is None:
             raise NoOriginError(
                 "The map has no origin on earth, so it cannot be written in a geographic format; "
                 "give one with --origin LAT,LON[,ALT]."
             )
-        return CRS.from_wkt(self.crs_wkt)
+        try:
+            return CRS.from_wkt(self.crs_wkt)
+        except CRSError as error:
+            raise CRSMismatchError(
+                f"The map frame's CRS is not WKT that pyproj reads: {reprlib.repr(self.crs_wkt)}."
+            ) from error
 
     @property
     def is_georeferenced(self) -> bool:
@@ -134,30 +152,60 @@ class MapFrame:
         """City points (N, 3), metres, to (N, 3) longitude, latitude (degrees) and height (metres)."""
         points = _checked(points_city) + self.offset_m
         lon, lat = self._to_wgs84.transform(points[:, 0], points[:, 1])
-        return np.column_stack([lon, lat, points[:, 2]])
+        return self._finite(np.column_stack([lon, lat, points[:, 2]]), points_city)
 
     def from_wgs84(self, lon_lat_height: NDArrayFloat) -> NDArrayFloat:
         """Longitude, latitude (degrees) and height (metres), (N, 3), to city points (N, 3)."""
         geographic = _checked(lon_lat_height)
         x, y = self._from_wgs84.transform(geographic[:, 0], geographic[:, 1])
-        return np.column_stack([x, y, geographic[:, 2]]) - self.offset_m
+        return self._finite(np.column_stack([x, y, geographic[:, 2]]), geographic) - self.offset_m
+
+    def _finite(self, result: NDArrayFloat, given: NDArrayFloat) -> NDArrayFloat:
+        # PROJ answers inf for what lies outside a projection, and for NaN.
+        bad = np.flatnonzero(~np.isfinite(result).all(axis=1))
+        if len(bad):
+            raise CRSMismatchError(
+                f"{len(bad)} points have no place in {self.crs.name!r}, the first is "
+                f"{np.asarray(given)[bad[0]].tolist()}; expected finite coordinates within its area."
+            )
+        return result
 
     def require_same(self, other: MapFrame) -> None:
         """Raise `CRSMismatchError` unless the other frame is this one."""
         same_crs = self.crs_wkt == other.crs_wkt or (
             self.crs_wkt is not None and other.crs_wkt is not None and self.crs == other.crs
         )
-        if not same_crs or not np.allclose(self.offset_m, other.offset_m, rtol=0, atol=1e-6):
+        same_offset = np.allclose(self.offset_m, other.offset_m, rtol=0, atol=1e-6)
+        same_datum = self.crs_wkt is None or self.vertical_datum == other.vertical_datum
+        if not (same_crs and same_offset and same_datum):
             raise CRSMismatchError(
                 f"Two frames were mixed: {self.describe()} and {other.describe()}."
             )
 
     def describe(self) -> str:
         """One line for people."""
-        if self.crs_wkt is None:
-            return "local metres without an origin"
         x, y, z = self.offset_m
-        return f"{self.crs.name} with city origin at ({x:.3f}, {y:.3f}, {z:.3f})"
+        if self.crs_wkt is None:
+            shift = f" shifted by ({x:.3f}, {y:.3f}, {z:.3f})" if any(self.offset_m) else ""
+            return "local metres without an origin" + shift
+        # The name alone is "unknown" for a projection made on an origin.
+        name = self.crs.name
+        if name == "unknown":
+            lat, lon = self._projection_centre
+            name = f"a projection on latitude {lat:.8f}, longitude {lon:.8f}"
+        return (
+            f"{name} with city origin at ({x:.3f}, {y:.3f}, {z:.3f}), heights above "
+            f"{self.vertical_datum}"
+        )
+
+    @property
+    def _projection_centre(self) -> tuple[float, float]:
+        operation = self.crs.coordinate_operation
+        values = {p.name: p.value for p in operation.params} if operation else {}
+        return (
+            float(values.get("Latitude of natural origin", float("nan"))),
+            float(values.get("Longitude of natural origin", float("nan"))),
+        )
 
 
 def _checked(points: NDArrayFloat) -> NDArrayFloat:

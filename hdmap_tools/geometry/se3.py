@@ -68,6 +68,11 @@ class SE3:
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape != (4, 4):
             raise ShapeError(f"A homogeneous transform is (4, 4), found {matrix.shape}.")
+        if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=1e-9):
+            raise ShapeError(
+                f"A homogeneous transform ends with the row (0, 0, 0, 1), found {matrix[3].tolist()}; "
+                "is it transposed?"
+            )
         return cls(matrix[:3, :3], matrix[:3, 3])
 
     @classmethod
@@ -141,7 +146,14 @@ class Trajectory:
             )
         if not (np.isfinite(rotations).all() and np.isfinite(translations).all()):
             raise PoseError("The trajectory holds NaN or infinite poses; expected finite numbers.")
-        if np.any(np.diff(times) <= 0):
+        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        bad = np.flatnonzero((off > 1e-6) | (np.linalg.det(rotations) < 0))
+        if len(bad):
+            raise PoseError(
+                f"The rotation of pose {bad[0]} is not orthonormal with determinant +1 (tolerance "
+                f"1e-6); {len(bad)} of {len(times)} are not."
+            )
+        if np.any(times[1:] <= times[:-1]):
             raise PoseError("Pose times must strictly increase; sort them and drop duplicates.")
         times.setflags(write=False)
         object.__setattr__(self, "timestamps_ns", times)
@@ -157,14 +169,21 @@ class Trajectory:
         Rows are sorted by time; of several rows at one time the first is kept.
         """
         times = np.asarray(timestamps_ns, dtype=np.int64)
-        wxyz = np.asarray(wxyz, dtype=np.float64).reshape(-1, 4)
+        wxyz, xyz_m = np.asarray(wxyz, dtype=np.float64), np.asarray(xyz_m, dtype=np.float64)
+        if len(times) == 0:
+            raise PoseError("A trajectory needs at least one pose, found none.")
+        if wxyz.shape != (len(times), 4) or xyz_m.shape != (len(times), 3):
+            raise ShapeError(
+                f"{len(times)} pose times need quaternions ({len(times)}, 4) and translations "
+                f"({len(times)}, 3), found {wxyz.shape} and {xyz_m.shape}."
+            )
         norms = np.linalg.norm(wxyz, axis=1)
         if not np.isfinite(norms).all() or (norms < 1e-9).any():
             row = int(np.flatnonzero(~np.isfinite(norms) | (norms < 1e-9))[0])
             raise PoseError(f"Pose {row} has no usable quaternion: {wxyz[row].tolist()}.")
         times, first = np.unique(times, return_index=True)
         rotations = Rotation.from_quat(wxyz[first][:, [1, 2, 3, 0]]).as_matrix()
-        return cls(times, rotations, np.asarray(xyz_m, dtype=np.float64)[first])
+        return cls(times, rotations, xyz_m[first])
 
     def __len__(self) -> int:
         return len(self.timestamps_ns)

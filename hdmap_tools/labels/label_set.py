@@ -35,6 +35,9 @@ DRIVABLE_CLASSES: Final = (MapClass.ROAD, MapClass.CROSSWALK, MapClass.LANE_MARK
 """Where a vehicle may be: the ground between the road's boundaries."""
 
 
+_Channel = Annotated[int, Field(ge=0, le=255)]
+
+
 class Label(BaseModel):
     """One label of a network or of an annotation.
 
@@ -50,8 +53,8 @@ class Label(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: Annotated[int, Field(ge=0, le=254)]
-    name: str
-    color: tuple[int, int, int]
+    name: Annotated[str, Field(min_length=1)]
+    color: tuple[_Channel, _Channel, _Channel]
     map_class: MapClass | None = None
     moves: bool = False
 
@@ -123,9 +126,12 @@ class LabelSet(BaseModel):
         """Refuse a label image that holds an id outside the set (255, to be ignored, is allowed).
 
         Raises:
-            LabelError: With the first bad id and how many pixels have one.
+            LabelError: With the lowest bad id and how many pixels have one, or
+                with the dtype if it is not one of whole numbers.
         """
-        bad = (label_image >= len(self)) & (label_image != IGNORE_ID)
+        if not np.issubdtype(label_image.dtype, np.integer):
+            raise LabelError(f"{what} holds {label_image.dtype}, expected uint8 label ids.")
+        bad = ((label_image < 0) | (label_image >= len(self))) & (label_image != IGNORE_ID)
         if bad.any():
             first = int(label_image[bad].min())
             raise LabelError(
@@ -163,5 +169,5 @@ def load_label_set(name_or_path: str | Path) -> LabelSet:
         )
     try:
         return LabelSet.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:
         raise LabelError(f"{path} is not a label set: {error}") from error

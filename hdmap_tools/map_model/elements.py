@@ -11,7 +11,6 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
-from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
 Geometry = Annotated[BaseGeometry, Field(exclude=True), WithJsonSchema({"type": "object"})]
@@ -29,15 +28,17 @@ class MapElement(BaseModel):
         plugin, plugin_version: Which vectorizer made it; empty for a map that was read.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False
+    )
 
     element_type: ClassVar[str] = "map_element"
     geometry_type: ClassVar[Literal["LineString", "Polygon"]] = "LineString"
 
     geometry: Geometry
     id: str = ""
-    confidence: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] = 1.0
-    sigma_m: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    confidence: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
+    sigma_m: Annotated[float, Field(ge=0.0)] = 0.0
     num_observations: Annotated[int, Field(ge=0)] = 0
     plugin: str = ""
     plugin_version: str = ""
@@ -45,8 +46,8 @@ class MapElement(BaseModel):
     @model_validator(mode="after")
     def _geometry_is_usable(self) -> MapElement:
         geometry = self.geometry
-        kind = {"LineString": LineString, "Polygon": Polygon}[self.geometry_type]
-        if not isinstance(geometry, kind):
+        # By name, not isinstance: a LinearRing is a LineString to Python, to no file format.
+        if geometry.geom_type != self.geometry_type:
             raise ValueError(
                 f"{self.element_type} needs a {self.geometry_type}, found {geometry.geom_type}"
             )

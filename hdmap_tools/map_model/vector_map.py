@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -38,11 +39,16 @@ class VectorMap:
     def __post_init__(self) -> None:
         ordered = tuple(sorted(self.elements, key=lambda e: (e.element_type, e.id)))
         ids = [element.id for element in ordered]
-        if len(set(ids)) != len(ids) or "" in ids:
-            repeated = sorted({i for i in ids if ids.count(i) > 1})[:3]
+        if "" in ids:
             raise FormatError(
-                f"Element ids must be unique and not empty; found again: {repeated or 'empty ids'}. "
+                f"Element ids must not be empty; {ids.count('')} of {len(ids)} are. "
                 "Call with_stable_ids first."
+            )
+        repeated = sorted(i for i, count in Counter(ids).items() if count > 1)
+        if repeated:
+            raise FormatError(
+                f"Element ids must be unique; {len(repeated)} occur again: {', '.join(repeated[:3])}. "
+                "Give each element an id of its own, or none and call with_stable_ids."
             )
         object.__setattr__(self, "elements", ordered)
 
@@ -86,12 +92,16 @@ def with_stable_ids(
     different place mostly keeps its id; several of one type in one place are
     numbered in a fixed order.
     """
+    elements = tuple(elements)
     taken = set(taken or ())
     result = [e for e in elements if e.id]
     taken.update(e.id for e in result)
     fresh = [e for e in elements if not e.id]
-    # Ties broken by the exact geometry, so that the order of arrival does not matter.
-    for element in sorted(fresh, key=lambda e: (e.element_type, _place(e), e.geometry.wkb)):
+    # Ties broken by geometry and attributes, so that the order of arrival does not matter.
+    for element in sorted(
+        fresh,
+        key=lambda e: (e.element_type, _place(e), e.geometry.wkb, e.model_dump_json()),
+    ):
         base = f"{element.element_type}-{_place(element)}"
         candidate, number = base, 1
         while candidate in taken:
