@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hdmap_tools.errors import DriveError, ShapeError
+from hdmap_tools.errors import DriveError, ShapeError, SweepError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import Trajectory
-from hdmap_tools.types import NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,3 +131,16 @@ def keep_finite(
     """Drop rows with NaN or infinite coordinates; also says how many were dropped."""
     finite = np.isfinite(points).all(axis=1)
     return points[finite], [column[finite] for column in columns], int((~finite).sum())
+
+
+def to_bytes(values: NDArrayAny, name: str, path: Path) -> NDArrayByte:
+    """Finite sensor values (N,) as uint8, rounded.
+
+    Raises:
+        SweepError: If a value lies outside 0..255: clipping or wrapping it would
+            change what the intensity means without a word.
+    """
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    if low < 0 or high > 255:
+        raise SweepError(f"Sweep {path}: {name} runs from {low:g} to {high:g}; expected 0..255.")
+    return np.asarray(np.rint(values), dtype=np.uint8)

@@ -1,0 +1,318 @@
+"""Drives in the Argoverse 2 sensor-log layout.
+
+**Sweeps are published ego-motion compensated to the time in their file name**, so
+they are not compensated again. The data set's documentation says so (docstring of
+`av2.structures.sweep.Sweep`), and measurement on the two recorded sweeps of log
+7fab2350 (ego turning 3.5 deg/s, 0.7 m/s) agrees. A laser of a spinning lidar draws
+a cone at constant elevation around *its* lidar at the speed of the turn:
+
+    points taken as            spread of elevation within a laser    rate of turn
+    seen at offset_ns (raw)    0.042 to 0.056 deg                    3579 to 3608 deg/s
+    compensated (undone first) 0.003 to 0.005 deg                    3599 to 3607 deg/s
+
+(lasers 0..31 in up_lidar, 32..63 in down_lidar; medians over lasers, both sweeps.)
+Static vertical planes of the two sweeps lie 7.8 mm apart (median, 28,771 points) as
+stored, 9.1 mm (21,273) when compensated once more, 8.7 mm (15,928) when undone.
+`is_compensated=False` is for logs written raw by others.
+
+**Images are published undistorted** although intrinsics.feather has k1, k2, k3:
+these describe the lens before undistortion. The data set's maintainers say so
+(argoverse/av2-api issues 219 and 226) and its own camera model projects with the
+matrix alone. `is_rectified=False` is for logs with raw images.
+
+Source:
+    https://argoverse.github.io/user-guide/datasets/sensor.html; `av2` package.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hdmap_tools.errors import CalibrationError, DriveError, PoseError, ShapeError, SweepError
+from hdmap_tools.geometry.camera import PinholeCamera
+from hdmap_tools.geometry.map_frame import MapFrame
+from hdmap_tools.geometry.se3 import SE3, Trajectory
+from hdmap_tools.readers.cameras import mount_from_quaternion, select_cameras
+from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_finite, to_bytes
+from hdmap_tools.readers.feather import read_columns
+from hdmap_tools.readers.motion import compensate_ego_motion
+
+logger = logging.getLogger(__name__)
+
+LAYOUT: Final = "av2"
+POSES_FILE: Final = "city_SE3_egovehicle.feather"
+LIDAR: Final = "lidar"
+
+CITY_UTM_ZONE_LAT_LON: Final[Mapping[str, tuple[int, float, float]]] = {
+    "ATX": (14, 30.27464237939507, -97.7404457407424),
+    "DTW": (17, 42.29993066912924, -83.17555750783717),
+    "MIA": (17, 25.77452579915163, -80.19656914449405),
+    "PAO": (10, 37.416065, -122.13571963362166),
+    "PIT": (17, 40.44177902989321, -80.01294377242584),
+    "WDC": (18, 38.889377, -77.0355047439081),
+}
+"""UTM zone (north) and latitude, longitude of each city frame's origin, degrees
+(`av2.geometry.utm`); the axes are those of the zone's grid."""
+
+_QUATERNION: Final = ("qw", "qx", "qy", "qz")
+_TRANSLATION: Final = ("tx_m", "ty_m", "tz_m")
+_INTRINSICS: Final = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+_LENS: Final = ("k1", "k2", "k3")
+_CITY_IN_MAP_NAME: Final = re.compile(r"____([A-Z]+)_city_")
+_IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
+
+
+def read_av2(
+    log_dir: Path,
+    cameras: Sequence[str] = (),
+    *,
+    is_compensated: bool = True,
+    is_rectified: bool = True,
+) -> Drive:
+    """List one log; images and sweeps are read later. Only the poses must exist.
+
+    Args:
+        log_dir: Folder of the log, with ``city_SE3_egovehicle.feather``.
+        cameras: Camera names; empty means all that can be used.
+        is_compensated: Whether the sweeps already refer to the time in their name;
+            if False, each is compensated by its offset_ns.
+        is_rectified: Whether the images are undistorted; if False, k1, k2 and k3 of
+            the intrinsics are applied.
+
+    Returns:
+        The drive, in the city frame of the log's map file.
+
+    Raises:
+        DriveError: If the log or a table of it is missing or broken.
+        CalibrationError: If no camera with images can be used, or one asked for cannot.
+        PoseError: If the poses are unusable.
+    """
+    log_dir = Path(log_dir)
+    if not log_dir.is_dir():
+        raise DriveError(f"{log_dir} is not a folder; expected that of an Argoverse 2 sensor log.")
+    warnings: list[str] = []
+    trajectory = _read_trajectory(log_dir / POSES_FILE, warnings)
+    image_files = _list_images(log_dir / "sensors" / "cameras", warnings)
+    calibrated, unusable = _read_cameras(log_dir / "calibration", is_rectified)
+    intrinsics_path = log_dir / "calibration" / "intrinsics.feather"
+    lack = "has no row for it" if intrinsics_path.exists() else "is missing"
+    for name in sorted(set(image_files) - set(calibrated) - set(unusable)):
+        unusable[name] = CalibrationError(
+            f"camera {name} has {len(image_files[name])} images but no calibration: "
+            f"{intrinsics_path} {lack}; add it or remove the images."
+        )
+    chosen, left_out = select_cameras(
+        calibrated, unusable, image_files, cameras, f"Log {log_dir.name}"
+    )
+    warnings += left_out
+    sweeps = [
+        SweepRef(time_ns, path, LIDAR)
+        for time_ns, path in _timed_files(
+            log_dir / "sensors" / LIDAR, frozenset({".feather"}), warnings
+        )
+    ]
+    maps = tuple(sorted((log_dir / "map").glob("log_map_archive_*.json")))
+    frame = _map_frame(maps, warnings)
+    for warning in warnings:
+        logger.warning("%s: %s", log_dir.name, warning)
+    return Drive(
+        name=log_dir.resolve().name,
+        layout=LAYOUT,
+        root=log_dir,
+        frame=frame,
+        trajectory=trajectory,
+        cameras=chosen,
+        images=tuple(
+            ImageRef(name, time_ns, path)
+            for name in chosen
+            for time_ns, path in image_files.get(name, [])
+        ),
+        sweeps=tuple(sweeps),
+        read_sweep=_sweep_reader(None if is_compensated else trajectory),
+        reference_maps=maps,
+        warnings=tuple(warnings),
+    )
+
+
+def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep:
+    """Read one sweep.
+
+    Args:
+        ref: The sweep.
+        trajectory: Poses for compensation by offset_ns; None if the points already
+            refer to the sweep's time.
+
+    Raises:
+        SweepError: If the file is missing, truncated, lacks columns or has no finite point.
+        PoseError: If the trajectory does not cover the sweep.
+    """
+    required = ("x", "y", "z", "intensity") + (("offset_ns",) if trajectory is not None else ())
+    columns = read_columns(ref.path, required, ("laser_number",), SweepError)
+    values = np.column_stack([columns[name].astype(np.float64) for name in columns])
+    values, _, num_dropped = keep_finite(values)
+    if not len(values):
+        found = f"all {num_dropped} points are NaN or infinite" if num_dropped else "it is empty"
+        raise SweepError(f"Sweep {ref.path} has no points: {found}; copy it again or remove it.")
+    if num_dropped:
+        logger.warning("%s: dropped %d points that are NaN or infinite", ref.path, num_dropped)
+    kept = dict(zip(columns, values.T, strict=True))
+    points = np.ascontiguousarray(values[:, :3])
+    if trajectory is not None:
+        points = compensate_ego_motion(
+            points, kept["offset_ns"].astype(np.int64), ref.timestamp_ns, trajectory
+        )
+    ring = kept.get("laser_number", np.zeros(len(points)))
+    return Sweep(
+        timestamp_ns=ref.timestamp_ns,
+        points_ego=points,
+        intensity=to_bytes(kept["intensity"], "intensity", ref.path),
+        ring=to_bytes(ring, "laser_number", ref.path),
+    )
+
+
+def _sweep_reader(trajectory: Trajectory | None) -> Callable[[SweepRef], Sweep]:
+    return lambda ref: read_av2_sweep(ref, trajectory)
+
+
+def _read_trajectory(path: Path, warnings: list[str]) -> Trajectory:
+    columns = read_columns(path, ("timestamp_ns", *_QUATERNION, *_TRANSLATION), (), PoseError)
+    times = columns["timestamp_ns"]
+    if not np.issubdtype(times.dtype, np.integer):
+        raise PoseError(f"{path}: timestamp_ns is {times.dtype}; expected integer nanoseconds.")
+    try:
+        trajectory = Trajectory.from_quaternions(
+            times.astype(np.int64),
+            np.column_stack([columns[name] for name in _QUATERNION]).astype(np.float64),
+            np.column_stack([columns[name] for name in _TRANSLATION]).astype(np.float64),
+        )
+    except (PoseError, ShapeError) as error:
+        raise PoseError(f"Poses in {path} are unusable: {error}") from error
+    if num_backward := int((np.diff(times.astype(np.int64)) < 0).sum()):
+        warnings.append(
+            f"poses in {path.name} go back in time {num_backward} times; they were sorted"
+        )
+    if num_repeated := len(times) - len(trajectory):
+        warnings.append(
+            f"{num_repeated} poses in {path.name} repeat a time; the first of each was kept"
+        )
+    return trajectory
+
+
+def _read_cameras(
+    calibration: Path, is_rectified: bool
+) -> tuple[dict[str, PinholeCamera], dict[str, DriveError]]:
+    """Usable cameras, and why others are not. No intrinsics file means no cameras."""
+    intrinsics_path = calibration / "intrinsics.feather"
+    mounts_path = calibration / "egovehicle_SE3_sensor.feather"
+    if not intrinsics_path.exists():
+        return {}, {}
+    lens = () if is_rectified else _LENS
+    intrinsics = read_columns(
+        intrinsics_path, ("sensor_name", *_INTRINSICS, *lens), (), CalibrationError
+    )
+    mounts = (
+        read_columns(
+            mounts_path, ("sensor_name", *_QUATERNION, *_TRANSLATION), (), CalibrationError
+        )
+        if mounts_path.exists()
+        else {"sensor_name": np.empty(0, dtype=object)}
+    )
+    row_of_mount = {str(name): row for row, name in enumerate(mounts["sensor_name"])}
+    calibrated: dict[str, PinholeCamera] = {}
+    unusable: dict[str, DriveError] = {}
+    for row, name in enumerate(str(name) for name in intrinsics["sensor_name"]):
+        values = {key: float(intrinsics[key][row]) for key in (*_INTRINSICS, *lens)}
+        try:
+            if name not in row_of_mount:
+                raise CalibrationError(
+                    f"camera {name} has intrinsics but no mount: {mounts_path} "
+                    f"{'has no row for it' if mounts_path.exists() else 'is missing'}; "
+                    "expected its pose in the ego frame."
+                )
+            mount = _mount(mounts, row_of_mount[name], name, mounts_path)
+            calibrated[name] = _camera(name, values, mount, intrinsics_path)
+        except CalibrationError as error:
+            unusable[name] = error
+    return calibrated, unusable
+
+
+def _mount(mounts: Mapping[str, Any], row: int, name: str, path: Path) -> SE3:
+    return mount_from_quaternion(
+        [mounts[key][row] for key in _QUATERNION],
+        np.array([mounts[key][row] for key in _TRANSLATION], dtype=np.float64),
+        name,
+        str(path),
+    )
+
+
+def _camera(name: str, values: Mapping[str, float], mount: SE3, path: Path) -> PinholeCamera:
+    width, height = values["width_px"], values["height_px"]
+    if not (np.isfinite([width, height]).all() and width == int(width) and height == int(height)):
+        raise CalibrationError(
+            f"camera {name} in {path} has image size ({width}, {height}); expected whole pixels."
+        )
+    k1, k2, k3 = (values.get(key, 0.0) for key in _LENS)
+    return PinholeCamera(
+        name=name,
+        width_px=int(width),
+        height_px=int(height),
+        fx=values["fx_px"],
+        fy=values["fy_px"],
+        cx=values["cx_px"],
+        cy=values["cy_px"],
+        ego_SE3_cam=mount,
+        distortion=(k1, k2, 0.0, 0.0, k3),
+    )
+
+
+def _list_images(folder: Path, warnings: list[str]) -> dict[str, list[tuple[int, Path]]]:
+    """Time and path of every image, by camera; cameras without images are left out."""
+    if not folder.is_dir():
+        return {}
+    listed = {
+        camera.name: _timed_files(camera, _IMAGE_SUFFIXES, warnings)
+        for camera in sorted(folder.iterdir())
+        if camera.is_dir()
+    }
+    return {name: files for name, files in listed.items() if files}
+
+
+def _timed_files(
+    folder: Path, suffixes: frozenset[str], warnings: list[str]
+) -> list[tuple[int, Path]]:
+    """Files named by their time in nanoseconds; others are counted in a warning."""
+    if not folder.is_dir():
+        return []
+    timed, others = [], 0
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        # isdecimal alone would let through digits of other scripts.
+        if path.stem.isascii() and path.stem.isdecimal():
+            timed.append((int(path.stem), path))
+        else:
+            others += 1
+    if others:
+        warnings.append(
+            f"{others} files in {folder} are not named by a time in nanoseconds; they were left out"
+        )
+    return timed
+
+
+def _map_frame(maps: Sequence[Path], warnings: list[str]) -> MapFrame:
+    found = {match[1] for path in maps if (match := _CITY_IN_MAP_NAME.search(path.name))}
+    if len(found) == 1 and (city := next(iter(found))) in CITY_UTM_ZONE_LAT_LON:
+        zone, lat, lon = CITY_UTM_ZONE_LAT_LON[city]
+        return MapFrame.from_crs(f"EPSG:326{zone}", (lat, lon))
+    what = f"names the cities {', '.join(sorted(found))}" if found else "names no city"
+    warnings.append(
+        f"map/log_map_archive_*.json {what} (expected one of {', '.join(CITY_UTM_ZONE_LAT_LON)}), "
+        "so the place on earth is unknown; geographic exports need --origin LAT,LON[,ALT]"
+    )
+    return MapFrame()
