@@ -10,9 +10,17 @@ from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.types import NDArrayByte
 
+_Positive = Annotated[float, Field(gt=0)]
+_Pixels = Annotated[int, Field(ge=1, le=16384)]
+
 
 class Segmenter(Protocol):
     """Turns camera images into label images."""
+
+    @property
+    def name(self) -> str:
+        """Names it in maps and messages; a network's confusion matrix is known by it."""
+        ...
 
     @property
     def label_set(self) -> LabelSet:
@@ -25,7 +33,10 @@ class Segmenter(Protocol):
         ...
 
     def segment(self, image: ImageRef) -> NDArrayByte:
-        """The label image (height, width) uint8 of one camera image, at the image's own size."""
+        """The label image (height, width) uint8 of one camera image, at the image's own size.
+
+        May be called from several threads at once.
+        """
         ...
 
 
@@ -42,18 +53,20 @@ class ModelProfile(BaseModel):
         scale: Pixel values 0..255 are multiplied by this first.
         mean, std: Then normalized, per channel in that order.
         output: ``scores`` (1, C, H, W), largest wins; ``ids`` (1, H, W) or (1, 1, H, W).
+        output_name: Which output holds them; needed when the network has several.
         source: Where model and figures come from.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
-    sha256: tuple[str, ...] = ()
+    sha256: tuple[Annotated[str, Field(pattern="^[0-9a-f]{64}$")], ...] = ()
     label_set: str
-    input_size_px: tuple[int, int] | None = None
+    input_size_px: tuple[_Pixels, _Pixels] | None = None
     channels: Literal["rgb", "bgr"] = "rgb"
-    scale: Annotated[float, Field(gt=0)] = 1 / 255
+    scale: _Positive = 1 / 255
     mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
-    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+    std: tuple[_Positive, _Positive, _Positive] = (0.229, 0.224, 0.225)
     output: Literal["scores", "ids"] = "scores"
+    output_name: str | None = None
     source: str = ""
