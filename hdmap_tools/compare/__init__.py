@@ -1,0 +1,1 @@
+"""Holding a result against maps that already exist."""
