@@ -58,20 +58,23 @@ class AssociationConfig(_Step):
     """How labels reach the ground.
 
     Attributes:
-        method: ``sparse`` puts the lidar sweep into the images, ``planar`` puts
-            the labels on a plane through the wheels' contact points.
+        method: ``surface`` looks each cell up at the height of the ground that the
+            sweep found (dense from one frame), ``sparse`` labels the sweep's own
+            points, ``planar`` looks each cell up on a plane (no lidar needed).
+        also: Methods that `hdmap run` builds in memory beside it, to compare with.
         max_range_m: Points further from the ego origin (in x-y) are not used.
         ground_tolerance_m: How far above or below the estimated ground a point still is ground.
         occlusion_test: Leave out points that nearer things hide from the camera.
-        planar_ahead_m: Reach of the planar method along the view; labels on a
-            plane spread quickly beyond it.
+        lookup_range_m: Reach of ``surface`` and ``planar`` from the camera; a pixel
+            covers more and more ground beyond it.
     """
 
-    method: Literal["sparse", "planar"] = "sparse"
+    method: Literal["surface", "sparse", "planar"] = "surface"
+    also: tuple[Literal["surface", "sparse", "planar"], ...] = ()
     max_range_m: Annotated[float, Field(gt=0)] = 40.0
     ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.2
     occlusion_test: bool = True
-    planar_ahead_m: Annotated[float, Field(gt=0)] = 25.0
+    lookup_range_m: Annotated[float, Field(gt=0)] = 25.0
 
 
 class FusionConfig(_Step):

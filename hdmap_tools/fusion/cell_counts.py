@@ -128,7 +128,9 @@ class CellCounts:
         for index, rows, y, x in _by_tile(votes.cells):
             counts = self._tile(index).layers["counts"].reshape(-1, TILE_CELLS, TILE_CELLS)
             np.add.at(counts, (votes.channels[rows], y, x), votes.quanta[rows].astype(np.uint32))
-        height_mm = np.rint((observations.points_city[:, 2] - self.meta.reference_height_m) * 1000.0)
+        height_mm = np.rint(
+            (observations.points_city[:, 2] - self.meta.reference_height_m) * 1000.0
+        )
         if np.abs(height_mm).max() > MAX_HEIGHT_MM:
             raise ShapeError(
                 f"A ground point is {np.abs(height_mm).max() / 1000:.0f} m from the map's reference "
@@ -212,8 +214,14 @@ def combine_tiles(mine: Tile, theirs: Tile, sign: int, index: TileIndex) -> Tile
         bad = (a > np.iinfo(dtype).max - b) if sign > 0 else (a < b)
         if bad.any():
             what = "overflows" if sign > 0 else "would fall below zero"
-            why = "the map holds too many frames" if sign > 0 else "the drive was not part of this map"
-            raise MapMismatchError(f"Layer {name!r} of tile {index} {what}: {why}. Nothing was changed.")
+            why = (
+                "the map holds too many frames"
+                if sign > 0
+                else "the drive was not part of this map"
+            )
+            raise MapMismatchError(
+                f"Layer {name!r} of tile {index} {what}: {why}. Nothing was changed."
+            )
         layers[name] = a + b if sign > 0 else a - b
     return Tile(layers)
 
@@ -247,9 +255,7 @@ def grid_of_tiles(indices: Iterable[TileIndex], meta: MapMeta) -> BevGrid | None
     )
 
 
-def window_of_tiles(
-    read: Callable[[TileIndex], Tile | None], grid: BevGrid, meta: MapMeta
-) -> Tile:
+def window_of_tiles(read: Callable[[TileIndex], Tile | None], grid: BevGrid, meta: MapMeta) -> Tile:
     """Cut a window out of tiles; zeros where `read` gives None."""
     window = Tile.zeros(len(meta.label_set), meta.num_bins, grid.shape)
     for ty in range(grid.y_min // TILE_CELLS, -(-grid.y_max // TILE_CELLS)):

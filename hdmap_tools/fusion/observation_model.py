@@ -96,7 +96,9 @@ def observation_model(
                 f"{meta.label_set.name!r} ({', '.join(meta.label_set.names)})."
             )
         likelihood, can_tell = confusion_likelihood(confusion, names, config.smoothing)
-    untold = [name for name, told in zip(names, can_tell, strict=True) if not told and name != OTHER]
+    untold = [
+        name for name, told in zip(names, can_tell, strict=True) if not told and name != OTHER
+    ]
     if untold:
         _LOG.info(
             "The labels of %s cannot tell %s; the map gives them probability 0.",
@@ -168,10 +170,7 @@ def _log_prior(
     open_names = [n for n, told in zip(names, can_tell, strict=True) if told and n not in given]
     rest = max(1.0 - sum(given.values()), 0.0) / max(len(open_names), 1)
     prior = np.array(
-        [
-            given.get(name, rest) if told else 0.0
-            for name, told in zip(names, can_tell, strict=True)
-        ]
+        [given.get(name, rest) if told else 0.0 for name, told in zip(names, can_tell, strict=True)]
     )
     if prior.sum() <= 0.0:
         raise ConfigError("No class is left with a prior above 0; check observation.priors.")

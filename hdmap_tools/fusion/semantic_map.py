@@ -94,7 +94,9 @@ class SemanticMap:
                     f"{path} exists already; add --overwrite to replace it, or choose another output."
                 )
             if not is_semantic_map(path):
-                raise OutputExistsError(f"{path} exists and is not a semantic map; it is left alone.")
+                raise OutputExistsError(
+                    f"{path} exists and is not a semantic map; it is left alone."
+                )
             shutil.rmtree(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

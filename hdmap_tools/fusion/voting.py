@@ -85,7 +85,9 @@ def cast_votes(
     row_of_label = cell * (int(label.max()) + 1) + label
     best_bin = _first_of_each(row_of_label, points, chance)
     if mode == "frame":
-        return Votes(unique_cells[cell[best_bin]], channel[best_bin], np.ones(len(best_bin), np.int64))
+        return Votes(
+            unique_cells[cell[best_bin]], channel[best_bin], np.ones(len(best_bin), np.int64)
+        )
     _, group = np.unique(row_of_label[best_bin], return_index=True)
     best_bin = best_bin[group]
     label_points = np.bincount(np.unique(row_of_label, return_inverse=True)[1], weights=points)

@@ -1,0 +1,46 @@
+"""Looking labels up in an image, and the cells that a camera may see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdmap_tools.geometry.camera import PinholeCamera, Projection
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.labels.label_set import IGNORE_ID, LabelSet
+from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
+
+
+def labels_at(label_image: NDArrayByte, uv: NDArrayFloat) -> NDArrayByte:
+    """Labels (N,) of the pixels nearest to positions uv (N, 2), which lie in the image."""
+    pixels = np.rint(uv).astype(np.int64)
+    return np.asarray(label_image[pixels[:, 1], pixels[:, 0]])
+
+
+def speaks_of_ground(labels: NDArrayByte, label_set: LabelSet) -> NDArrayBool:
+    """(N,) bool: labels that say something about the ground seen there.
+
+    A moving object's label is evidence about the object, not about what it hides.
+    """
+    return np.asarray((labels != IGNORE_ID) & ~np.isin(labels, label_set.moving_ids))
+
+
+def cell_centres_around(
+    camera: PinholeCamera, city_SE3_ego: SE3, resolution_m: float, reach_m: float
+) -> NDArrayFloat:
+    """City positions (N, 2) of the lattice's cell centres within reach of a camera.
+
+    Centres of the map's own cells, so that a frame asks each cell exactly once.
+    """
+    centre = city_SE3_ego.transform_from(camera.ego_SE3_cam.translation[None])[0, :2]
+    middle = np.floor(centre / resolution_m)
+    reach = np.arange(-(reach_m // resolution_m) - 1, reach_m // resolution_m + 2)
+    steps = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    xy = (middle + steps + 0.5) * resolution_m
+    return np.asarray(xy[np.linalg.norm(xy - centre, axis=1) <= reach_m])
+
+
+def project_city(
+    points_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3
+) -> Projection:
+    """Project city points (N, 3) into a camera at an ego pose."""
+    return camera.project(city_SE3_ego.inverse().transform_from(points_city))

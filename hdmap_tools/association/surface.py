@@ -1,0 +1,86 @@
+"""Surface association: labels laid on the ground that the sweep found.
+
+Between the rings of a lidar lie metres without a return, but the ground there
+is known all the same: it runs on from ring to ring. So every cell of the map
+that the camera sees is put at the height of the ground surface and looked up,
+which gives a dense map from a single frame and, unlike the planar method,
+follows slope, crown and kerbs. Cells further than 4 m from ground that was
+seen stay unknown.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdmap_tools.association.ground import GroundedSweep, GroundSurface
+from hdmap_tools.association.lookup import (
+    cell_centres_around,
+    labels_at,
+    project_city,
+    speaks_of_ground,
+)
+from hdmap_tools.association.observations import Observations
+from hdmap_tools.association.visibility import is_unoccluded
+from hdmap_tools.config import AssociationConfig
+from hdmap_tools.geometry.camera import PinholeCamera, Projection
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.labels.label_set import LabelSet
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
+
+
+def associate_surface(
+    label_image: NDArrayByte,
+    label_set: LabelSet,
+    camera: PinholeCamera,
+    city_SE3_ego: SE3,
+    grounded: GroundedSweep,
+    resolution_m: float,
+    config: AssociationConfig,
+) -> Observations:
+    """Look up the label of each ground cell that a camera sees.
+
+    Args:
+        label_image: (height, width) uint8 ids, the camera's size.
+        label_set: What the ids mean.
+        camera: Calibrated camera.
+        city_SE3_ego: Ego pose at the image's own time.
+        grounded: The sweep, which gives the ground and what stands on it.
+        resolution_m: Cell size; one look-up at the centre of each cell.
+        config: `lookup_range_m` is the reach from the camera.
+    """
+    xy_city = cell_centres_around(camera, city_SE3_ego, resolution_m, config.lookup_range_m)
+    points_city = _onto_surface(xy_city, grounded.city_SE3_ego, grounded.surface)
+    projection = project_city(points_city, camera, city_SE3_ego)
+    use = projection.is_valid
+    if config.occlusion_test:
+        standing = grounded.points_city[~grounded.is_ground]
+        occluders = project_city(standing, camera, city_SE3_ego)
+        both = Projection(
+            np.concatenate([projection.uv, occluders.uv]),
+            np.concatenate([projection.depth_m, occluders.depth_m]),
+            np.concatenate([projection.is_valid, occluders.is_valid]),
+        )
+        is_occluder = np.arange(len(both.depth_m)) >= len(use)
+        use = is_unoccluded(both, is_occluder, camera)[: len(use)]
+    labels = labels_at(label_image, projection.uv[use])
+    speaks = speaks_of_ground(labels, label_set)
+    return Observations(points_city[use][speaks], labels[speaks])
+
+
+def _onto_surface(
+    xy_city: NDArrayFloat, city_SE3_ego: SE3, surface: GroundSurface
+) -> NDArrayFloat:
+    """City points (N, 3) on a ground surface given in the ego frame; only where it is known.
+
+    The ego frame is nearly upright: the position on the surface is found by two
+    steps of a fixed point, which leaves less than a millimetre at 5 degrees of tilt.
+    """
+    ego_SE3_city = city_SE3_ego.inverse()
+    z_city = np.full(len(xy_city), city_SE3_ego.translation[2])
+    for _ in range(3):
+        points_ego = ego_SE3_city.transform_from(np.column_stack([xy_city, z_city]))
+        height_ego = surface.height_at(points_ego[:, :2])
+        z_city = z_city + (height_ego - points_ego[:, 2]) * city_SE3_ego.rotation[2, 2]
+        known = np.isfinite(z_city)
+        xy_city, z_city = xy_city[known], z_city[known]
+    return np.column_stack([xy_city, z_city])

@@ -1,0 +1,227 @@
+"""From a drive and its labels to counts: association and fusion, frame by frame."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hdmap_tools.association.ground import GroundedSweep
+from hdmap_tools.association.observations import Observations
+from hdmap_tools.association.planar import associate_planar, ground_plane
+from hdmap_tools.association.sparse import associate_sparse
+from hdmap_tools.association.surface import associate_surface
+from hdmap_tools.config import AssociationConfig, Config
+from hdmap_tools.errors import ConfigError, DriveError, PoseError
+from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.intensity import otsu_threshold
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
+from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
+from hdmap_tools.types import NDArrayByte
+
+_LOG = logging.getLogger(__name__)
+
+LabelledImages = Iterable[tuple[ImageRef, NDArrayByte]]
+
+_THRESHOLD_WITHOUT_LIDAR = 128
+_IMAGES_FOR_THRESHOLD = 24
+
+
+@dataclass
+class FrameCounts:
+    """How many images were used, and why others were not.
+
+    Attributes:
+        used: Images that were fused.
+        dropped: Number of images by reason.
+    """
+
+    used: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+
+
+class FrameSource:
+    """Poses and sweeps of a drive's images; keeps the last sweep, which several cameras share."""
+
+    def __init__(self, drive: Drive, config: Config) -> None:
+        self._drive = drive
+        self._config = config
+        self._grounded: tuple[int, GroundedSweep] | None = None
+
+    def usable_images(self, counts: FrameCounts) -> tuple[ImageRef, ...]:
+        """Images with a pose (and a sweep, where the method needs one); the rest is counted.
+
+        Raises:
+            DriveError: If the drive has no image at all.
+            PoseError: If a camera has no image with a pose.
+        """
+        drive, config = self._drive, self._config
+        if not drive.images:
+            raise DriveError(
+                f"Drive {drive.name} has no images, so there is nothing to segment. Expected images of "
+                f"{', '.join(drive.cameras) or 'a calibrated camera'} in {drive.root}."
+            )
+        times = np.array([image.timestamp_ns for image in drive.images], dtype=np.int64)
+        has_pose = drive.trajectory.covers(times, config.drive.max_pose_gap_s)
+        with_pose = [i for i, ok in zip(drive.images, has_pose, strict=True) if ok]
+        for camera in sorted({image.camera for image in drive.images}):
+            if not any(image.camera == camera for image in with_pose):
+                first, last = drive.trajectory.timestamps_ns[[0, -1]]
+                raise PoseError(
+                    f"Camera {camera}: no image has an ego pose. Poses run from {first} to {last} ns; "
+                    f"the gap allowed is drive.max_pose_gap_s = {config.drive.max_pose_gap_s} s. Leave "
+                    "the camera out with --camera, or repair the poses."
+                )
+        counts.dropped["no ego pose"] = len(drive.images) - len(with_pose)
+        methods = {config.association.method, *config.association.also}
+        if methods <= {"planar"}:
+            return tuple(with_pose)
+        usable = [image for image in with_pose if self.sweep_ref(image) is not None]
+        if not usable:
+            raise DriveError(
+                f"Drive {drive.name}: no image has a lidar sweep within drive.max_sweep_gap_s = "
+                f"{config.drive.max_sweep_gap_s} s ({len(drive.sweeps)} sweeps). Use "
+                "association.method: planar, which needs no lidar, or allow a longer gap."
+            )
+        counts.dropped["no lidar sweep near in time"] = len(with_pose) - len(usable)
+        return tuple(usable)
+
+    def pose(self, timestamp_ns: int) -> SE3:
+        """``city_SE3_ego`` at a time."""
+        return self._drive.trajectory.interpolate(timestamp_ns, self._config.drive.max_pose_gap_s)
+
+    def sweep_ref(self, image: ImageRef) -> SweepRef | None:
+        """The sweep nearest to an image in time, if it is near enough."""
+        return self._drive.nearest_sweep(image.timestamp_ns, self._config.drive.max_sweep_gap_s)
+
+    def grounded_sweep(self, image: ImageRef) -> GroundedSweep | None:
+        """The sweep nearest to an image, with its ground."""
+        ref = self.sweep_ref(image)
+        if ref is None:
+            return None
+        if self._grounded is None or self._grounded[0] != ref.timestamp_ns:
+            sweep = self._drive.read_sweep(ref)
+            association = self._config.association
+            grounded = GroundedSweep.from_sweep(
+                sweep,
+                self.pose(sweep.timestamp_ns),
+                association.max_range_m,
+                association.ground_tolerance_m,
+            )
+            self._grounded = (ref.timestamp_ns, grounded)
+        return self._grounded[1]
+
+    def observe(
+        self, method: str, image: ImageRef, labels: NDArrayByte, label_set: LabelSet, resolution_m: float
+    ) -> Observations:
+        """What one image says about the ground, by one method of association."""
+        config: AssociationConfig = self._config.association
+        camera = self._drive.cameras[image.camera]
+        pose, grounded = self.pose(image.timestamp_ns), self.grounded_sweep(image)
+        if method == "planar":
+            plane = ground_plane(grounded)
+            return associate_planar(labels, label_set, camera, pose, plane, resolution_m, config)
+        if grounded is None:
+            raise DriveError(f"No lidar sweep near image {image.key}; method {method!r} needs one.")
+        if method == "sparse":
+            return associate_sparse(labels, label_set, camera, pose, grounded, config)
+        return associate_surface(labels, label_set, camera, pose, grounded, resolution_m, config)
+
+
+def map_meta(config: Config, drive: Drive, label_set: LabelSet, model: str, threshold: int) -> MapMeta:
+    """What a map built from this drive with this configuration means."""
+    return MapMeta(
+        resolution_m=config.fusion.resolution_m,
+        label_set=label_set,
+        count_mode=config.fusion.count_mode,
+        intensity_threshold=threshold,
+        reference_height_m=config.fusion.reference_height_m,
+        frame_document=drive.frame.to_json(),
+        model=model,
+    )
+
+
+def fuse(
+    source: FrameSource, labelled: LabelledImages, meta: MapMeta, methods: tuple[str, ...], counts: FrameCounts
+) -> dict[str, CellCounts]:
+    """Associate and count labelled images, by each method on its own.
+
+    Args:
+        source: Poses and sweeps.
+        labelled: Images with their label images.
+        meta: What the counts mean.
+        methods: Methods of association; one result each.
+        counts: Told how many images were used.
+    """
+    result = {method: CellCounts(meta) for method in methods}
+    for image, labels in labelled:
+        for method, cell_counts in result.items():
+            seen = source.observe(method, image, labels, meta.label_set, meta.resolution_m)
+            cell_counts.add(seen, frame_key(image))
+        counts.used += 1
+    return result
+
+
+def in_segments(labelled: LabelledImages, images_per_segment: int) -> Iterator[list[tuple[ImageRef, NDArrayByte]]]:
+    """Cut a stream of labelled images into pieces that are fused and committed one by one."""
+    segment: list[tuple[ImageRef, NDArrayByte]] = []
+    for item in labelled:
+        segment.append(item)
+        if len(segment) == images_per_segment:
+            yield segment
+            segment = []
+    if segment:
+        yield segment
+
+
+def frame_key(image: ImageRef) -> int:
+    """A number that names a frame, the same in every run; breaks ties between labels."""
+    return int.from_bytes(hashlib.sha256(image.key.encode()).digest()[:8], "little")
+
+
+def intensity_threshold(
+    config: Config,
+    source: FrameSource,
+    images: tuple[ImageRef, ...],
+    labels_of: Callable[[tuple[ImageRef, ...]], LabelledImages],
+    label_set: LabelSet,
+) -> int:
+    """k as configured, or by Otsu's method on returns that were labelled road or paint.
+
+    Args:
+        config: `fusion.intensity_threshold`.
+        source: Poses and sweeps.
+        images: Images of the drive; up to 24, spread evenly, are looked at.
+        labels_of: Gives the label images of some images.
+        label_set: What their ids mean.
+    """
+    given = config.fusion.intensity_threshold
+    if given != "auto":
+        return given
+    with_sweep = tuple(image for image in images if source.sweep_ref(image) is not None)
+    if not with_sweep:
+        return _THRESHOLD_WITHOUT_LIDAR
+    step = max(len(with_sweep) // _IMAGES_FOR_THRESHOLD, 1)
+    drivable = [label.id for label in label_set.labels if label.map_class in DRIVABLE_CLASSES]
+    if not drivable:
+        raise ConfigError(
+            f"Label set {label_set.name!r} has no label for road or paint, so the intensity of paint "
+            "cannot be estimated; set fusion.intensity_threshold."
+        )
+    seen = [
+        observations.intensity[np.isin(observations.labels, drivable)]
+        for image, labels in labels_of(with_sweep[::step])
+        if (observations := source.observe("sparse", image, labels, label_set, 1.0)).intensity is not None
+    ]
+    threshold = otsu_threshold(np.concatenate(seen)) if seen else None
+    if threshold is None:
+        _LOG.warning("Lidar intensity on the road is uniform: it cannot tell paint (k = 255).")
+        return 255
+    _LOG.info("Intensity threshold k = %d, by Otsu on %d returns.", threshold, sum(map(len, seen)))
+    return threshold
