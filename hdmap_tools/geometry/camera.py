@@ -193,6 +193,9 @@ def _monotone_radius(distortion: tuple[float, ...]) -> float:
     if k1 == k2 == k3 == 0.0:
         return float("inf")
     # d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3, s = r^2.
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    coefficients = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
+    # Of no effect below 89.9 degrees from the axis, and poison for the root finder.
+    coefficients[np.abs(coefficients) < 1e-18] = 0.0
+    roots = np.roots(coefficients)
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
     return float(np.sqrt(real.min())) if len(real) else float("inf")

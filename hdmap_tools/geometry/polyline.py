@@ -23,7 +23,12 @@ def resample(points: NDArrayFloat, step_m: float) -> NDArrayFloat:
     lengths = arc_lengths(points)
     count = max(round(float(lengths[-1]) / step_m), 1) + 1
     at = np.linspace(0.0, lengths[-1], count)
-    return np.column_stack([np.interp(at, lengths, points[:, k]) for k in range(points.shape[1])])
+    sampled = np.column_stack(
+        [np.interp(at, lengths, points[:, k]) for k in range(points.shape[1])]
+    )
+    # Where several vertices share the end's place in the plane, interpolation takes any of them.
+    sampled[0], sampled[-1] = points[0], points[-1]
+    return sampled
 
 
 def drop_repeats(points: NDArrayFloat, min_step_m: float = 1e-6) -> NDArrayFloat:

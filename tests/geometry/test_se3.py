@@ -19,7 +19,9 @@ def assert_close(a: SE3, b: SE3, tolerance: float = 1e-8) -> None:
 def test_quaternion_is_scalar_first() -> None:
     half = np.sqrt(0.5)
     turn = SE3.from_quaternion(half, 0.0, 0.0, half, np.zeros(3))
-    np.testing.assert_allclose(turn.transform_from([[1.0, 0.0, 0.0]]), [[0.0, 1.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(
+        turn.transform_from([[1.0, 0.0, 0.0]]), [[0.0, 1.0, 0.0]], atol=1e-15
+    )
     assert turn.yaw_rad == pytest.approx(np.pi / 2, abs=1e-15)
     flip = SE3.from_quaternion(0.0, 1.0, 0.0, 0.0, np.zeros(3))
     np.testing.assert_allclose(flip.rotation, np.diag([1.0, -1.0, -1.0]), atol=1e-15)

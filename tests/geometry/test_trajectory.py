@@ -45,9 +45,7 @@ def test_midpoint_turns_half_and_moves_half(quarter_turn: Trajectory) -> None:
 @given(st.lists(poses(), min_size=1, max_size=5), st.data())
 def test_own_times_give_the_very_poses(transforms: list[SE3], data: st.DataObject) -> None:
     steps = data.draw(
-        st.lists(
-            st.integers(1, 10**12), min_size=len(transforms) - 1, max_size=len(transforms) - 1
-        )
+        st.lists(st.integers(1, 10**12), min_size=len(transforms) - 1, max_size=len(transforms) - 1)
     )
     times = np.cumsum([START_NS, *steps])
     track = trajectory(list(times), transforms)
@@ -90,7 +88,9 @@ def test_outside_and_in_gaps_there_is_no_pose(quarter_turn: Trajectory) -> None:
     for time_ns in (START_NS - 1, START_NS + 1_100_000_001, START_NS + 600_000_000):
         with pytest.raises(PoseError, match=rf"No ego pose at {time_ns} ns.*max_pose_gap_s"):
             quarter_turn.interpolate(time_ns, 0.5)
-    assert quarter_turn.interpolate(START_NS + 600_000_000, 1.0).translation[1] == pytest.approx(9.0)
+    assert quarter_turn.interpolate(START_NS + 600_000_000, 1.0).translation[1] == pytest.approx(
+        9.0
+    )
 
 
 def test_one_pose_covers_its_own_time_only() -> None:
