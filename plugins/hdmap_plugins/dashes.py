@@ -1,0 +1,214 @@
+"""Which strokes of paint are one line: dashes in a regular rhythm, and lines broken by wear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hdmap_plugins.profiles import Stroke
+from hdmap_plugins.sampling import nearest
+from hdmap_tools.types import NDArrayBool, NDArrayFloat
+
+
+@dataclass(frozen=True)
+class JoinRules:
+    """When strokes belong together; lengths in cells.
+
+    Attributes:
+        max_gap: Longest gap between two dashes.
+        max_dash: Longer strokes are no dashes.
+        bridge_gap: Longest gap in an unbroken line (wear), over known cells only.
+        min_dashes: Fewer make no rhythm.
+        rhythm: Share by which dashes and gaps may differ from their median.
+        max_angle_deg: Largest angle between a stroke's end and the way to the next.
+    """
+
+    max_gap: float
+    max_dash: float
+    bridge_gap: float
+    min_dashes: int
+    rhythm: float
+    max_angle_deg: float
+
+
+@dataclass(frozen=True)
+class Line:
+    """Strokes along one line, in order and all in its direction."""
+
+    strokes: tuple[Stroke, ...]
+    is_dashed: bool
+
+
+@dataclass(frozen=True)
+class _Gap:
+    length: float
+    is_known: bool
+
+
+def join_strokes(strokes: list[Stroke], is_known: NDArrayBool, rules: JoinRules) -> list[Line]:
+    """Put strokes together that are one painted line.
+
+    Each free end looks for the stroke that continues it; two ends that choose one
+    another are neighbours. Along such a row, at least ``min_dashes`` short strokes of
+    like length at like gaps are one dashed line. A gap over unknown cells may also
+    hide whole dashes, if it fits the rhythm; nothing else is bridged over unknown
+    cells. What is no dash is joined over short known gaps only.
+    """
+    lines: list[Line] = []
+    for row in _rows(strokes, rules):
+        gaps = [_gap(a, b, is_known) for a, b in pairwise(row)]
+        start = 0
+        while start < len(row):
+            length = _dashed_run(row[start:], gaps[start:], rules)
+            if length >= rules.min_dashes:
+                lines.append(Line(tuple(row[start : start + length]), True))
+                start += length
+                continue
+            # Unbroken until a gap too long or unknown, or until dashes begin.
+            end = start + 1
+            while (
+                end < len(row)
+                and gaps[end - 1].is_known
+                and gaps[end - 1].length <= rules.bridge_gap
+                and _dashed_run(row[end:], gaps[end:], rules) < rules.min_dashes
+            ):
+                end += 1
+            lines.append(Line(tuple(row[start:end]), False))
+            start = end
+    return lines
+
+
+def _dashed_run(row: list[Stroke], gaps: list[_Gap], rules: JoinRules) -> int:
+    """How many strokes from the first on make one rhythm (1 when none do)."""
+    best = 1
+    for count in range(rules.min_dashes, len(row) + 1):
+        lengths = np.array([s.length for s in row[:count]])
+        known = np.array([g.length for g in gaps[: count - 1] if g.is_known])
+        if len(known) == 0:
+            # Every gap is unseen: no rhythm was observed yet.
+            continue
+        gap = float(np.median(known))
+        # First and last may be cut off by the edge of what was seen.
+        inner = lengths[1:-1] if count > 2 else lengths
+        dash = float(np.median(inner))
+        dash_slack, gap_slack = rules.rhythm * dash + 2.0, rules.rhythm * gap + 2.0
+        regular = (
+            gap <= rules.max_gap
+            and lengths.max() <= min(rules.max_dash, dash + dash_slack)
+            and np.all(np.abs(inner - dash) <= dash_slack)
+            and all(_fits(g, gap, dash, gap_slack) for g in gaps[: count - 1])
+        )
+        if not regular:
+            break
+        best = count
+    return best
+
+
+def _fits(gap: _Gap, typical: float, dash: float, slack: float) -> bool:
+    if abs(gap.length - typical) <= slack:
+        return True
+    hidden = round((gap.length - typical) / (typical + dash))
+    off = abs(gap.length - typical - hidden * (typical + dash))
+    return not gap.is_known and hidden >= 1 and off <= slack
+
+
+def _gap(a: Stroke, b: Stroke, is_known: NDArrayBool) -> _Gap:
+    first, last = a.xy_cells[-1], b.xy_cells[0]
+    length = float(np.hypot(*(last - first)))
+    places = np.linspace(first, last, max(int(np.ceil(length * 2.0)), 2))[1:-1]
+    return _Gap(length, bool(np.all(nearest(is_known, places))) if len(places) else True)
+
+
+def _outward(stroke: Stroke, end: int) -> NDArrayFloat:
+    """Unit direction in which a stroke leaves at its end, over its last twenty cells."""
+    xy = stroke.xy_cells if end == 1 else stroke.xy_cells[::-1]
+    tail = xy[-min(len(xy), 20) :]
+    chord: NDArrayFloat = tail[-1] - tail[0]
+    return chord / max(float(np.hypot(*chord)), 1e-12)
+
+
+def _rows(strokes: list[Stroke], rules: JoinRules) -> list[list[Stroke]]:
+    """Strokes in rows of mutual neighbours, each turned into the direction of its row."""
+    ends = [
+        (i, e)
+        for i, s in enumerate(strokes)
+        for e in (0, 1)
+        if not s.at_junction[e] and not s.is_closed
+    ]
+    place = {k: strokes[k[0]].xy_cells[0 if k[1] == 0 else -1] for k in ends}
+    leave = {k: _outward(strokes[k[0]], k[1]) for k in ends}
+    reach = max(rules.max_gap, rules.bridge_gap) * 3.0
+    choice: dict[tuple[int, int], tuple[float, tuple[int, int]]] = {}
+    for p in ends:
+        options = []
+        for q in ends:
+            if p[0] == q[0]:
+                continue
+            cost = _cost(place[p], leave[p], place[q], leave[q], reach, rules.max_angle_deg)
+            if cost is not None:
+                options.append((cost, q))
+        if options:
+            choice[p] = min(options)
+    partner = {p: q for p, (_, q) in choice.items() if q in choice and choice[q][1] == p}
+
+    rows: list[list[Stroke]] = []
+    used: set[int] = set()
+    starts = [p for p in ends if p not in partner] + list(ends)
+    for start in starts:
+        if start[0] in used:
+            continue
+        row: list[Stroke] = []
+        at: tuple[int, int] | None = start
+        while at is not None and at[0] not in used:
+            used.add(at[0])
+            row.append(strokes[at[0]] if at[1] == 0 else strokes[at[0]].reversed())
+            at = partner.get((at[0], 1 - at[1]))
+        rows.append(row)
+    rows += [[s] for i, s in enumerate(strokes) if i not in used]
+    return rows
+
+
+def _cost(
+    from_xy: NDArrayFloat,
+    heading: NDArrayFloat,
+    to_xy: NDArrayFloat,
+    other_heading: NDArrayFloat,
+    reach: float,
+    max_angle_deg: float,
+) -> float | None:
+    """Distance, made longer by every bend; None when the ends do not continue one another."""
+    chord = to_xy - from_xy
+    distance = float(np.hypot(*chord))
+    if distance > reach:
+        return None
+    if distance < 1e-9:
+        return 0.0
+    # Over a gap of a few cells the angle of the way across is noise.
+    slack = float(np.arctan2(1.5, distance))
+    limit = np.radians(max_angle_deg) + slack
+    turn_out = _turn(heading, chord)
+    turn_in = _turn(chord, -other_heading)
+    if abs(turn_out) > limit or abs(turn_in) > limit:
+        return None
+    # On an arc both turns are equal; opposite ones are a jump to a parallel line.
+    if abs(turn_out - turn_in) > 0.6 * np.radians(max_angle_deg) + 2.0 * slack:
+        return None
+    return distance * (1.0 + abs(turn_out) + abs(turn_in))
+
+
+def _turn(a: NDArrayFloat, b: NDArrayFloat) -> float:
+    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
+
+
+def stations_of(line: Line) -> tuple[NDArrayFloat, NDArrayBool]:
+    """Stations along a whole line about one cell apart, and which of them are painted."""
+    parts, painted = [line.strokes[0].xy_cells], [np.ones(len(line.strokes[0].xy_cells), bool)]
+    for a, b in pairwise(line.strokes):
+        first, last = a.xy_cells[-1], b.xy_cells[0]
+        count = max(round(float(np.hypot(*(last - first)))) - 1, 0)
+        between = np.linspace(first, last, count + 2)[1:-1]
+        parts += [between, b.xy_cells]
+        painted += [np.zeros(len(between), bool), np.ones(len(b.xy_cells), bool)]
+    return np.vstack(parts), np.concatenate(painted)
