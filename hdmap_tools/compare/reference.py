@@ -221,11 +221,14 @@ def is_truth(share: NDArrayFloat, min_share: float) -> NDArrayBool:
     return np.asarray(share >= min_share - SHARE_TOLERANCE)
 
 
-def describe_rule(min_share: float) -> str:
+def describe_rule(min_share: float, has_lines: bool = False) -> str:
     """The rule of `is_truth` in words."""
     if min_share == 0.0:
         return "a cell is truth when any part of it is marked"
-    return f"a cell is truth when at least {min_share:g} of it is marked"
+    rule = f"a cell is truth when at least {min_share:g} of it is marked"
+    if has_lines:
+        rule += f"; for lines, {min_share:g} of what a line so wide covers at most"
+    return rule
 
 
 def group_name(classes: Sequence[MapClass]) -> str:

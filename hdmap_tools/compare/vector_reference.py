@@ -82,6 +82,9 @@ def reference_from_vector_map(
         grid: Cells to draw on.
         source: Its name in reports.
         min_share: Share of a cell that must be covered for it to be truth; 0 means any.
+            Of a line narrower than a cell, this share of what it covers at most (its
+            width over the cell's): else half of all thin lines would vanish, those
+            that run along a cell edge.
         mark_width_m: Width of lane marks that have none.
         assume_same_frame: See `load_reference`.
 
@@ -91,8 +94,8 @@ def reference_from_vector_map(
     """
     relation = frame_relation(vector_map.frame, grid.frame, source, assume_same_frame)
     notes = list(relation.notes)
-    areas = _areas(vector_map, mark_width_m)
-    if not areas:
+    areas, paint = _areas(vector_map), _paint(vector_map, mark_width_m)
+    if not areas and not paint:
         found = ", ".join(f"{n} {t}" for t, n in vector_map.counts().items()) or "no elements"
         raise FormatError(
             f"Reference {source} has nothing to draw as cells: found {found}; expected crosswalks, lane "
@@ -103,7 +106,11 @@ def reference_from_vector_map(
             name: [_taken_over(g, vector_map.frame, grid.frame) for g in geometries]
             for name, geometries in areas.items()
         }
-    drawn = [g for geometries in areas.values() for g in geometries]
+        paint = {
+            width: [_taken_over(g, vector_map.frame, grid.frame) for g in geometries]
+            for width, geometries in paint.items()
+        }
+    drawn = [g for some in (*areas.values(), *paint.values()) for g in some]
     x0, y0, x1, y1 = (float(b) for b in shapely.total_bounds(drawn))
     gx0, gy0, gx1, gy1 = grid.bounds_m
     if not (x0 < gx1 and x1 > gx0 and y0 < gy1 and y1 > gy0):
@@ -112,12 +119,16 @@ def reference_from_vector_map(
         name: is_truth(coverage_share(geometries, grid), min_share)
         for name, geometries in areas.items()
     }
+    for width_m, geometries in paint.items():
+        needed = min_share * min(width_m / grid.resolution_m, 1.0)
+        marked = is_truth(coverage_share(geometries, grid), needed)
+        truth[MapClass.LANE_MARK] = truth.get(MapClass.LANE_MARK, False) | marked
     groups = []
     if DRIVABLE_GROUP in truth:
         groups.append(ReferenceGroup(DRIVABLE_GROUP, DRIVABLE_CLASSES, truth[DRIVABLE_GROUP]))
-        paint = [truth[c] for c in (MapClass.CROSSWALK, MapClass.LANE_MARK) if c in truth]
-        if paint:
-            bare = truth[DRIVABLE_GROUP] & ~np.logical_or.reduce(paint)
+        painted = [truth[c] for c in (MapClass.CROSSWALK, MapClass.LANE_MARK) if c in truth]
+        if painted:
+            bare = truth[DRIVABLE_GROUP] & ~np.logical_or.reduce(painted)
             groups.append(ReferenceGroup(str(MapClass.ROAD), (MapClass.ROAD,), bare))
     else:
         notes.append(f"{source} has no closed road boundary and no lanelet, so no road area.")
@@ -133,22 +144,29 @@ def reference_from_vector_map(
         tuple(groups),
         np.ones(grid.shape, dtype=bool),
         source,
-        describe_rule(min_share),
+        describe_rule(min_share, has_lines=bool(paint)),
         tuple(notes),
     )
 
 
-def _areas(vector_map: VectorMap, mark_width_m: float) -> dict[str, list[BaseGeometry]]:
+def _paint(vector_map: VectorMap, mark_width_m: float) -> dict[float, list[BaseGeometry]]:
+    """2D strips of paint by their width in metres, in the map's own frame."""
+    strips: dict[float, list[BaseGeometry]] = {}
+    lines = [(m.geometry, m.width_m or mark_width_m) for m in vector_map.of_type(LaneMark)]
+    lines += [
+        (s.geometry, s.width_m or DEFAULT_STOP_LINE_WIDTH_M) for s in vector_map.of_type(StopLine)
+    ]
+    for line, width_m in lines:
+        strips.setdefault(round(width_m, 3), []).append(_widened(line, width_m))
+    return strips
+
+
+def _areas(vector_map: VectorMap) -> dict[str, list[BaseGeometry]]:
     """2D areas by group, in the map's own frame; only groups that have some."""
-    marks = vector_map.of_type(LaneMark)
-    stops = vector_map.of_type(StopLine)
-    paint = [_widened(m.geometry, m.width_m or mark_width_m) for m in marks]
-    paint += [_widened(s.geometry, s.width_m or DEFAULT_STOP_LINE_WIDTH_M) for s in stops]
     road = _road_areas(vector_map)
     found: dict[str, list[BaseGeometry]] = {
         DRIVABLE_GROUP: road,
         MapClass.CROSSWALK: [c.geometry for c in vector_map.of_type(Crosswalk)],
-        MapClass.LANE_MARK: paint,
         MapClass.SIDEWALK: [a.geometry for a in vector_map.of_type(SidewalkArea)],
         MapClass.VEGETATION: [a.geometry for a in vector_map.of_type(VegetationArea)],
     }

@@ -60,6 +60,7 @@ def agreement_picture(
     bounds_m: tuple[float, float, float, float] | None = None,
     title: str = "",
     panel_px: int = 800,
+    overwrite: bool = False,
 ) -> None:
     """Write a PNG, north up, with one map for each group of the reference.
 
@@ -72,10 +73,12 @@ def agreement_picture(
         trajectory_xy: (N, 2) or (N, 3) driven path, city metres.
         bounds_m: What to show, (x0, y0, x1, y1); None shows all cells with evidence.
         title: On top; None names the reference.
-        panel_px: Largest side of a map, pixels.
+        panel_px: About the largest side of a map, pixels.
+        overwrite: Replace an existing file.
 
     Raises:
         ShapeError: If the compared cells are not known or do not fit.
+        OutputExistsError: If the file exists and overwrite is False.
     """
     cells = comparison.compared if compared is None else compared
     if cells is None or cells.shape != window.grid.shape:
@@ -109,14 +112,15 @@ def agreement_picture(
         LegendEntry("miss (only the reference)", MISS),
         LegendEntry("false alarm (only the map)", FALSE_ALARM),
         LegendEntry("neither", BOTH_NEGATIVE),
-        LegendEntry("not compared", NOT_OBSERVED),
-        LegendEntry("reference, not compared", TRUTH_NOT_OBSERVED),
+        LegendEntry("not observed, or out of range", NOT_OBSERVED),
+        LegendEntry("reference there", TRUTH_NOT_OBSERVED),
     ]
-    rows = [maps[i : i + 3] for i in range(0, len(maps), 3)]
+    columns = 2 if len(maps) in (2, 4) else 3
+    rows = [maps[i : i + columns] for i in range(0, len(maps), columns)]
     heading = (
         title or f"Compared with {comparison.reference}: {comparison.area_m2:.0f} square metres"
     )
-    write_png(compose(rows, legend, title=heading), path)
+    write_png(compose(rows, legend, title=heading), path, overwrite=overwrite)
 
 
 def _figures(score: GroupScore) -> str:

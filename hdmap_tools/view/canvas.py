@@ -8,8 +8,6 @@ up to half a pixel off, enough to hide or fake a misaligned map.
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +21,7 @@ from shapely.ops import substring
 
 from hdmap_tools.compare.rasterize import unit_coverage
 from hdmap_tools.errors import ShapeError
+from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.types import NDArrayByte, NDArrayFloat, NDArrayInt
 from hdmap_tools.view.palette import INK, PAPER, RGB
@@ -254,11 +253,12 @@ def draw_north_arrow(picture: NDArrayByte) -> None:
     put_text(picture, "N", (u, v + 38), size=0.5, bold=True, anchor="middle")
 
 
-def write_png(picture: NDArrayByte, path: Path) -> None:
+def write_png(picture: NDArrayByte, path: Path, *, overwrite: bool = False) -> None:
     """Write a picture (height, width, 3) uint8 RGB as PNG: whole or not at all, same bytes each time.
 
     Raises:
         ShapeError: If it is not such an array.
+        OutputExistsError: If the file exists and overwrite is False.
     """
     import cv2
 
@@ -270,21 +270,5 @@ def write_png(picture: NDArrayByte, path: Path) -> None:
     done, data = cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 6])
     if not done:
         raise ShapeError(f"A picture of {picture.shape} cannot be written as PNG.")
-    _write_atomic(data.tobytes(), path)
-
-
-def _write_atomic(data: bytes, path: Path) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        # mkstemp gives 0600; a picture is as readable as any file its owner makes.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(data.tobytes())

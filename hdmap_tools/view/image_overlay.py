@@ -83,41 +83,50 @@ def _paint_cells(
     """Blend the class colour of the ground cell that each pixel looks at."""
     if not window.is_known.any():
         return
-    rows, cols = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
-    uv = np.column_stack([cols.ravel(), rows.ravel()])
-    rays_city = camera.rays_ego(uv) @ city_SE3_ego.rotation.T
+    rows, cols = np.indices((camera.height_px, camera.width_px), dtype=np.float64)
+    rays_city = camera.rays_ego(np.column_stack([cols.ravel(), rows.ravel()]))
+    rays_city = rays_city @ city_SE3_ego.rotation.T
     eye = city_SE3_ego.transform_from(camera.ego_SE3_cam.translation[None])[0]
-    looks_down = np.flatnonzero(rays_city[:, 2] < -1e-6)
-    grid_rows, grid_cols, hit = _ground_cells(window, eye, rays_city[looks_down], max_range_m)
+    pixels, cells = _ground_cells(window, eye, rays_city, max_range_m)
     best = np.nan_to_num(window.dataset["posterior"].values, nan=-1.0).argmax(axis=0)
     colors = np.array([class_color(c) for c in window.classes], dtype=np.float64)
-    seen = looks_down[hit]
-    paint = colors[best[grid_rows[hit], grid_cols[hit]]]
     flat = picture.reshape(-1, 3)
-    flat[seen] = np.round(flat[seen] * (1 - opacity) + paint * opacity).astype(np.uint8)
+    paint = colors[best.ravel()[cells]]
+    flat[pixels] = np.round(flat[pixels] * (1 - opacity) + paint * opacity).astype(np.uint8)
 
 
 def _ground_cells(
     window: MapWindow, eye: NDArrayFloat, rays: NDArrayFloat, max_range_m: float
-) -> tuple[NDArrayInt, NDArrayInt, NDArrayBool]:
-    """Grid row and column that each downward ray (N, 3) from the eye meets, and whether it does.
+) -> tuple[NDArrayInt, NDArrayInt]:
+    """Which rays (N, 3) from the eye meet a known cell, and its flat index.
 
     The ground is a height for each cell: meet a level plane, look up the height there,
     meet the plane of that height, and so on; a ray whose height does not settle is dropped.
     """
     height = _height_everywhere(window)
     rows, cols = window.grid.shape
+    highest = float(height.max())
+    # Rays that pass the highest ground beyond the range meet all ground beyond it.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (min(highest, eye[2]) - eye[2]) / rays[:, 2]
+        reach = along * np.hypot(rays[:, 0], rays[:, 1])
+    pixels = np.flatnonzero((rays[:, 2] < 0) & (reach <= max_range_m))
+    rays = rays[pixels]
+    slope = rays[:, :2] / rays[:, 2:]
     z = np.full(len(rays), float(np.median(height)))
     for _ in range(_HEIGHT_ITERATIONS):
-        along = (z - eye[2]) / rays[:, 2]
-        xy = eye[:2] + along[:, None] * rays[:, :2]
-        at = window.grid.rows_cols_of(np.where(np.abs(xy) < 1e9, xy, 1e9))
-        inside = window.grid.contains(at)
-        row, col = np.clip(at[:, 0], 0, rows - 1), np.clip(at[:, 1], 0, cols - 1)
-        used, z = z, height[row, col]
-    near = (along > 0) & (((xy - eye[:2]) ** 2).sum(axis=1) <= max_range_m**2)
-    settled = np.abs(z - used) < _HEIGHT_TOLERANCE_M
-    return row, col, inside & near & settled & window.is_known[row, col]
+        xy = eye[:2] + (z - eye[2])[:, None] * slope
+        at = np.floor(np.clip(xy / window.grid.resolution_m, -1e9, 1e9)).astype(np.int64)
+        at -= (window.grid.x_min, window.grid.y_min)
+        inside = ((at >= 0) & (at < (cols, rows))).all(axis=1)
+        cells = np.clip(at[:, 1], 0, rows - 1) * cols + np.clip(at[:, 0], 0, cols - 1)
+        used, z = z, height.ravel()[cells]
+        if np.abs(z - used).max(initial=0.0) < 1e-3:
+            break
+    hit = inside & (used < eye[2]) & (np.abs(z - used) < _HEIGHT_TOLERANCE_M)
+    hit &= ((xy - eye[:2]) ** 2).sum(axis=1) <= max_range_m**2
+    hit &= window.is_known.ravel()[cells]
+    return pixels[hit], cells[hit]
 
 
 def _height_everywhere(window: MapWindow) -> NDArrayFloat:

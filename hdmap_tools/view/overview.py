@@ -134,6 +134,7 @@ def overview_picture(
     title: str = "",
     panel_px: int = 900,
     image_height_px: int = 420,
+    overwrite: bool = False,
 ) -> None:
     """Write one page: camera images above, maps side by side below, legend at the foot.
 
@@ -147,12 +148,14 @@ def overview_picture(
         city_SE3_ego: Where to put the arrow of the vehicle.
         bounds_m: What to show; None shows all cells with evidence.
         title: On top.
-        panel_px: Largest side of a map, pixels.
+        panel_px: About the largest side of a map, pixels.
         image_height_px: Height of the images, pixels.
+        overwrite: Replace an existing file.
 
     Raises:
         ShapeError: If there is no panel, or an image is not RGB uint8.
         CRSMismatchError: If the maps are in different frames.
+        OutputExistsError: If the file exists and overwrite is False.
     """
     page = overview_page(
         panels,
@@ -164,7 +167,7 @@ def overview_picture(
         panel_px=panel_px,
         image_height_px=image_height_px,
     )
-    write_png(page, path)
+    write_png(page, path, overwrite=overwrite)
 
 
 def overview_page(
@@ -224,12 +227,12 @@ def known_bounds(windows: Sequence[MapWindow]) -> tuple[float, float, float, flo
 
 
 def fitting_scale(
-    bounds_m: tuple[float, float, float, float], resolution_m: float, max_px: int
+    bounds_m: tuple[float, float, float, float], resolution_m: float, about_px: int
 ) -> float:
-    """Pixels per metre that fit max_px, a whole number of pixels a cell where that is possible."""
+    """Pixels per metre that about fit about_px: a whole number of pixels a cell, unless cells are smaller."""
     x0, y0, x1, y1 = bounds_m
-    largest = max_px / max(x1 - x0, y1 - y0)
-    whole = np.floor(largest * resolution_m + 1e-9)
+    largest = about_px / max(x1 - x0, y1 - y0)
+    whole = np.round(largest * resolution_m)
     return float(whole / resolution_m if whole >= 1 else largest)
 
 

@@ -33,7 +33,7 @@ FAINT_INK: Final[RGB] = (110, 116, 124)
 PATH: Final[RGB] = (20, 20, 20)
 
 CLASS_COLORS: Final[dict[str, RGB]] = {
-    MapClass.ROAD: (158, 164, 174),
+    MapClass.ROAD: (150, 156, 184),
     MapClass.CROSSWALK: (204, 121, 167),
     MapClass.LANE_MARK: (240, 216, 40),
     MapClass.VEGETATION: (120, 190, 150),
