@@ -293,13 +293,12 @@ def read_only(window: MapWindow) -> MapWindow:
 
 
 def _sealed(array: NDArrayAny) -> NDArrayAny:
-    view = array.view()
-    view.setflags(write=False)
-    try:
-        view.setflags(write=True)
-    except ValueError:
-        return view
-    # The memory behind it is writeable, so anyone could turn the flag back; bytes are not.
+    root: Any = array
+    while isinstance(root, np.ndarray):
+        root = root.base
+    if isinstance(root, bytes):
+        return array
+    # A flag could be turned back, on the array or on what it is a view of; bytes never change.
     return np.frombuffer(array.tobytes(), dtype=array.dtype).reshape(array.shape)
 
 

@@ -242,10 +242,9 @@ def test_describe_tells_options_with_limits_and_meanings(fakes: FakePlugins) -> 
                     width_m: How wide it is,
                         at most.
                 """
-                from pydantic import Field as _Field
-                width_m: float = _Field(default=0.5, gt=0, le=2)
+                width_m: float = Field(default=0.5, gt=0, le=2)
                 color: MarkColor | None = None
-                votes: int = _Field(default=3, description="How many | at least.")
+                votes: int = Field(default=3, description="How many | at least.")
             def vectorize(self, window, upstream, options, *, rng):
                 return []
             '''

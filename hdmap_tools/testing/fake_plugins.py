@@ -14,7 +14,9 @@ from typing import Any, Final
 _NUMBERS: Final = itertools.count()
 
 PLUGIN_TEMPLATE: Final = """\
+from typing import Annotated
 import numpy as np
+from pydantic import Field, field_validator
 from shapely.geometry import LineString, Polygon
 from hdmap_tools.plugin_api import *
 
