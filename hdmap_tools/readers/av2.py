@@ -34,7 +34,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hdmap_tools.errors import CalibrationError, DriveError, PoseError, ShapeError, SweepError
+from hdmap_tools.errors import CalibrationError, DriveError, PoseError, SweepError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
@@ -42,6 +42,7 @@ from hdmap_tools.readers.cameras import mount_from_quaternion, select_cameras
 from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_finite, to_bytes
 from hdmap_tools.readers.feather import read_columns
 from hdmap_tools.readers.motion import compensate_ego_motion
+from hdmap_tools.readers.poses import trajectory_from_table
 
 logger = logging.getLogger(__name__)
 
@@ -185,21 +186,17 @@ def _read_trajectory(path: Path, warnings: list[str]) -> Trajectory:
     times = columns["timestamp_ns"]
     if not np.issubdtype(times.dtype, np.integer):
         raise PoseError(f"{path}: timestamp_ns is {times.dtype}; expected integer nanoseconds.")
-    try:
-        trajectory = Trajectory.from_quaternions(
-            times.astype(np.int64),
-            np.column_stack([columns[name] for name in _QUATERNION]).astype(np.float64),
-            np.column_stack([columns[name] for name in _TRANSLATION]).astype(np.float64),
-        )
-    except (PoseError, ShapeError) as error:
-        raise PoseError(f"Poses in {path} are unusable: {error}") from error
-    if num_backward := int((np.diff(times.astype(np.int64)) < 0).sum()):
+    times = times.astype(np.int64)
+    trajectory = trajectory_from_table(
+        times,
+        np.column_stack([columns[name] for name in _QUATERNION]).astype(np.float64),
+        np.column_stack([columns[name] for name in _TRANSLATION]).astype(np.float64),
+        path,
+        warnings,
+    )
+    if num_backward := int((np.diff(times) < 0).sum()):
         warnings.append(
             f"poses in {path.name} go back in time {num_backward} times; they were sorted"
-        )
-    if num_repeated := len(times) - len(trajectory):
-        warnings.append(
-            f"{num_repeated} poses in {path.name} repeat a time; the first of each was kept"
         )
     return trajectory
 

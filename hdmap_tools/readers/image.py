@@ -1,7 +1,8 @@
 """Read one camera image, and notice when it is damaged.
 
-`cv2.imdecode` returns a partly grey image for a truncated JPEG and says nothing;
-its grey would be labelled and counted. So the file's structure is walked first.
+`cv2.imread` returns a partly grey image for a truncated JPEG, with a word on stderr
+only; its grey would be labelled and counted. What `cv2.imdecode` does depends on the
+version of OpenCV. So the file's structure is walked first.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hdmap_tools.errors import CalibrationError, DriveError, PoseError, ShapeError, SweepError
+from hdmap_tools.errors import CalibrationError, DriveError, PoseError, SweepError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
@@ -37,6 +37,7 @@ from hdmap_tools.readers.nuscenes_tables import (
     choose_version_folder,
     read_table,
 )
+from hdmap_tools.readers.poses import trajectory_from_table
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +96,7 @@ def read_nuscenes(
     sensors = by_token(read_table(folder, "sensor"))
 
     warnings: list[str] = []
-    trajectory = _trajectory(poses, folder)
+    trajectory = _trajectory(poses, folder, warnings)
     channels = _by_channel(data, calibrations, sensors, folder)
     posed, unposed = _with_pose(channels, poses, folder)
     calibrated: dict[str, PinholeCamera] = {}
@@ -205,19 +206,21 @@ def _row_of(rows: Mapping[str, Row], token: str, table: str, folder: Path) -> Ro
     return rows[token]
 
 
-def _trajectory(poses: Mapping[str, Row], folder: Path) -> Trajectory:
+def _trajectory(poses: Mapping[str, Row], folder: Path, warnings: list[str]) -> Trajectory:
     path = folder / "ego_pose.json"
     if not poses:
         raise PoseError(f"Table {path} has none of the poses that the scene refers to.")
     rows = sorted(poses.values(), key=lambda r: (int(r["timestamp"]), str(r["token"])))
     try:
-        return Trajectory.from_quaternions(
-            np.array([int(r["timestamp"]) * 1000 for r in rows], dtype=np.int64),
-            np.array([r["rotation"] for r in rows], dtype=np.float64),
-            np.array([r["translation"] for r in rows], dtype=np.float64),
-        )
-    except (PoseError, ShapeError, ValueError, TypeError) as error:
-        raise PoseError(f"Poses in {path} are unusable: {error}") from error
+        wxyz = np.array([r["rotation"] for r in rows], dtype=np.float64)
+        xyz_m = np.array([r["translation"] for r in rows], dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise PoseError(
+            f"Poses in {path} are unusable: expected 4 numbers of rotation and 3 of translation in "
+            f"each row ({error})."
+        ) from error
+    times = np.array([r["timestamp"] for r in rows], dtype=np.int64) * 1000
+    return trajectory_from_table(times, wxyz, xyz_m, path, warnings)
 
 
 def _by_channel(
