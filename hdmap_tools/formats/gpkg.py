@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import NoneType
-from typing import Any, Final, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Final, get_args, get_origin
 
 import numpy as np
 import shapely
@@ -36,6 +36,9 @@ from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import ELEMENT_TYPES, MapElement, element_type_by_name
 from hdmap_tools.map_model.vector_map import VectorMap, with_stable_ids
 from hdmap_tools.types import NDArrayAny
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 _log = logging.getLogger(__name__)
 
@@ -237,7 +240,7 @@ def _checked_frame(frame: MapFrame | None, layer_crs: str | None, name: str) -> 
     if frame is None:
         crs = CRS.from_user_input(layer_crs) if layer_crs else None
         return MapFrame() if crs is None or crs.is_engineering else MapFrame(crs.to_wkt())
-    if frame.is_georeferenced and layer_crs and not _same_crs(frame.crs, CRS(layer_crs)):
+    if frame.is_georeferenced and layer_crs and not _is_same_place(frame, CRS(layer_crs)):
         raise CRSMismatchError(
             f"{name} is in {CRS(layer_crs).name!r}, the map in {frame.crs.name!r}; "
             "save the layer in the map's CRS."
@@ -245,8 +248,15 @@ def _checked_frame(frame: MapFrame | None, layer_crs: str | None, name: str) -> 
     return frame
 
 
-def _same_crs(a: Any, b: Any) -> bool:
-    return bool(a == b or a.equals(b, ignore_axis_order=True) or a.to_proj4() == b.to_proj4())
+def _is_same_place(frame: MapFrame, crs: CRS) -> bool:
+    """Whether coordinates mean the same; GDAL may spell a CRS differently than it was given."""
+    if frame.crs.equals(crs, ignore_axis_order=True):
+        return True
+    if not crs.is_projected:
+        return False
+    around = np.array([[0.0, 0.0, 0.0], [5e3, 0.0, 0.0], [0.0, 5e3, 0.0]])
+    other = MapFrame(crs.to_wkt(), frame.offset_m, frame.vertical_datum)
+    return bool(np.allclose(frame.to_wgs84(around), other.to_wgs84(around), rtol=0, atol=1e-9))
 
 
 @contextlib.contextmanager
