@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -61,18 +62,21 @@ class AssociationConfig(_Step):
         method: ``surface`` looks each cell up at the height of the ground that the
             sweep found (dense from one frame), ``sparse`` labels the sweep's own
             points, ``planar`` looks each cell up on a plane (no lidar needed).
-        also: Methods that `hdmap run` builds in memory beside it, to compare with.
+        also: Methods that `hdmap run` builds in memory beside it, to compare with;
+            those that need lidar are left out where there is none.
         max_range_m: Points further from the ego origin (in x-y) are not used.
-        ground_tolerance_m: How far above or below the estimated ground a point still is ground.
+        ground_tolerance_m: How far above or below the estimated ground a point still is
+            ground. At 0.2 m the feet of barriers and the fronts of kerbs come in, which
+            cost 1.6 points of IoU on a recorded keyframe.
         occlusion_test: Leave out points that nearer things hide from the camera.
         lookup_range_m: Reach of ``surface`` and ``planar`` from the camera; a pixel
             covers more and more ground beyond it.
     """
 
     method: Literal["surface", "sparse", "planar"] = "surface"
-    also: tuple[Literal["surface", "sparse", "planar"], ...] = ()
+    also: tuple[Literal["surface", "sparse", "planar"], ...] = ("sparse", "planar")
     max_range_m: Annotated[float, Field(gt=0)] = 40.0
-    ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.2
+    ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.1
     occlusion_test: bool = True
     lookup_range_m: Annotated[float, Field(gt=0)] = 25.0
 
@@ -162,10 +166,12 @@ class CompareConfig(_Step):
         reference: Mask picture with its JSON, or a vector map; None takes what
             lies with the drive.
         max_range_m: Only cells this near to the driven path are compared; None is no limit.
+        count_filled: Also compare cells that hole filling took from their neighbours.
     """
 
     reference: Path | None = None
     max_range_m: Annotated[float, Field(gt=0)] | None = 40.0
+    count_filled: bool = False
 
 
 class Config(_Step):
@@ -191,7 +197,10 @@ class Config(_Step):
 
     def to_yaml(self) -> str:
         """The document that `load_config` reads back."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+        document = self.model_dump(mode="json")
+        # PyYAML writes U+0085 bare and reads it back as a line break.
+        has_break = "\x85" in json.dumps(document, ensure_ascii=False)
+        return yaml.safe_dump(document, sort_keys=False, allow_unicode=not has_break)
 
 
 def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
@@ -209,11 +218,13 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
     document: Any = {}
     if path is not None:
         try:
-            document = yaml.safe_load(path.read_text(encoding="utf-8"))
+            document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
         except FileNotFoundError as error:
             raise ConfigError(f"No configuration file {path}.") from error
         except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-            raise ConfigError(f"{path} is not readable YAML: {error}") from error
+            raise ConfigError(
+                f"{path} is not readable YAML: {' '.join(str(error).split())}"
+            ) from error
         document = {} if document is None else document
         if not isinstance(document, dict):
             raise ConfigError(
@@ -245,6 +256,23 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
         raise ConfigError(f"{path or 'configuration'}: " + "; ".join(lines)) from error
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML without repeated keys, of which PyYAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            # `<<` may stand twice and is resolved by the base class.
+            if isinstance(key_node, yaml.ScalarNode) and key_node.value != "<<":
+                if key_node.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"{key_node.value!r} stands twice", problem_mark=key_node.start_mark
+                    )
+                seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
 def _short(value: Any) -> str:
     # A few lines of YAML aliases can stand for gigabytes of text.
-    return reprlib.repr(value)
+    text = reprlib.repr(value)
+    return text if len(text) <= 120 else text[:117] + "..."

@@ -54,6 +54,15 @@ class FrameSource:
         self._config = config
         self._grounded: tuple[int, GroundedSweep] | None = None
 
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The configured method of association, then those to compare with that the drive allows."""
+        association = self._config.association
+        also = [m for m in association.also if m != association.method]
+        if association.method == "planar" and not self._drive.sweeps:
+            also = []
+        return (association.method, *dict.fromkeys(also))
+
     def usable_images(self, counts: FrameCounts) -> tuple[ImageRef, ...]:
         """Images with a pose (and a sweep, where the method needs one); the rest is counted.
 
@@ -79,8 +88,7 @@ class FrameSource:
                     "the camera out with --camera, or repair the poses."
                 )
         counts.dropped["no ego pose"] = len(drive.images) - len(with_pose)
-        methods = {config.association.method, *config.association.also}
-        if methods <= {"planar"}:
+        if self.methods == ("planar",):
             return tuple(with_pose)
         usable = [image for image in with_pose if self.sweep_ref(image) is not None]
         if not usable:
@@ -118,7 +126,12 @@ class FrameSource:
         return self._grounded[1]
 
     def observe(
-        self, method: str, image: ImageRef, labels: NDArrayByte, label_set: LabelSet, resolution_m: float
+        self,
+        method: str,
+        image: ImageRef,
+        labels: NDArrayByte,
+        label_set: LabelSet,
+        resolution_m: float,
     ) -> Observations:
         """What one image says about the ground, by one method of association."""
         config: AssociationConfig = self._config.association
@@ -134,7 +147,9 @@ class FrameSource:
         return associate_surface(labels, label_set, camera, pose, grounded, resolution_m, config)
 
 
-def map_meta(config: Config, drive: Drive, label_set: LabelSet, model: str, threshold: int) -> MapMeta:
+def map_meta(
+    config: Config, drive: Drive, label_set: LabelSet, model: str, threshold: int
+) -> MapMeta:
     """What a map built from this drive with this configuration means."""
     return MapMeta(
         resolution_m=config.fusion.resolution_m,
@@ -148,7 +163,11 @@ def map_meta(config: Config, drive: Drive, label_set: LabelSet, model: str, thre
 
 
 def fuse(
-    source: FrameSource, labelled: LabelledImages, meta: MapMeta, methods: tuple[str, ...], counts: FrameCounts
+    source: FrameSource,
+    labelled: LabelledImages,
+    meta: MapMeta,
+    methods: tuple[str, ...],
+    counts: FrameCounts,
 ) -> dict[str, CellCounts]:
     """Associate and count labelled images, by each method on its own.
 
@@ -168,7 +187,9 @@ def fuse(
     return result
 
 
-def in_segments(labelled: LabelledImages, images_per_segment: int) -> Iterator[list[tuple[ImageRef, NDArrayByte]]]:
+def in_segments(
+    labelled: LabelledImages, images_per_segment: int
+) -> Iterator[list[tuple[ImageRef, NDArrayByte]]]:
     """Cut a stream of labelled images into pieces that are fused and committed one by one."""
     segment: list[tuple[ImageRef, NDArrayByte]] = []
     for item in labelled:
@@ -192,7 +213,7 @@ def intensity_threshold(
     labels_of: Callable[[tuple[ImageRef, ...]], LabelledImages],
     label_set: LabelSet,
 ) -> int:
-    """k as configured, or by Otsu's method on returns that were labelled road or paint.
+    """The threshold k as configured, or by Otsu's method on returns that were labelled road or paint.
 
     Args:
         config: `fusion.intensity_threshold`.
@@ -217,7 +238,8 @@ def intensity_threshold(
     seen = [
         observations.intensity[np.isin(observations.labels, drivable)]
         for image, labels in labels_of(with_sweep[::step])
-        if (observations := source.observe("sparse", image, labels, label_set, 1.0)).intensity is not None
+        if (observations := source.observe("sparse", image, labels, label_set, 1.0)).intensity
+        is not None
     ]
     threshold = otsu_threshold(np.concatenate(seen)) if seen else None
     if threshold is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -31,7 +31,7 @@ LATTICE_CELLS: Final = 2**21
 MAX_HEIGHT_MM: Final = 3_000_000
 """Heights further from the reference would overflow the sum of squares within two million points."""
 
-LAYERS: Final = {
+LAYERS: Final[dict[str, type[np.integer[Any]]]] = {
     "counts": np.uint32,
     "height_n": np.uint32,
     "height_sum": np.int64,

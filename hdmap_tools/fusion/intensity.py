@@ -27,10 +27,9 @@ def otsu_threshold(intensity: NDArrayByte) -> int | None:
     below = np.cumsum(counts)[:-1]
     above = total - below
     sum_below = np.cumsum(counts * np.arange(256))[:-1]
-    mean_gap = (
-        sum_below / np.maximum(below, 1) - (sum_below[-1] + counts[255] * 255 - sum_below)
-        / np.maximum(above, 1)
-    )
+    mean_gap = sum_below / np.maximum(below, 1) - (
+        sum_below[-1] + counts[255] * 255 - sum_below
+    ) / np.maximum(above, 1)
     between = below * above * mean_gap**2
     # The gap between two groups is flat: take its middle, not its first value.
     best = np.flatnonzero(between >= between.max() * (1 - 1e-12))

@@ -8,12 +8,12 @@ On a local disk exactly one process may commit at a time.
 
 from __future__ import annotations
 
-import logging
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     import icechunk
     import zarr
 
-_LOG = logging.getLogger(__name__)
 _BRANCH: Final = "main"
 _HALF: Final = LATTICE_CELLS // 2
 
@@ -85,7 +84,7 @@ class SemanticMap:
                 what is there is not a semantic map.
             StoreError: If the folder cannot be written.
         """
-        import icechunk
+        icechunk = _icechunk()
         import zarr
 
         if path.exists():
@@ -126,7 +125,7 @@ class SemanticMap:
         Raises:
             StoreError: If there is no map, its schema is newer than ours, or it is damaged.
         """
-        import icechunk
+        icechunk = _icechunk()
         import zarr
 
         if not is_semantic_map(path):
@@ -289,6 +288,14 @@ class SemanticMap:
         import zarr
 
         return zarr.open_group(self._session().store, mode="r")
+
+
+def _icechunk() -> ModuleType:
+    """The library, told to keep to itself what its warnings say of every local store: one writer."""
+    import icechunk
+
+    icechunk.set_logs_filter("error")
+    return icechunk
 
 
 def is_semantic_map(path: Path) -> bool:

@@ -1,0 +1,66 @@
+"""`hdmap build`: a drive into a semantic map."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from hdmap_tools.cli import options
+
+
+@click.command()
+@click.argument("drive", type=options.PATH)
+@click.option("-o", "--out", type=options.PATH, required=True, help="Semantic map to make.")
+@options.drive_options
+@options.segmentation_options
+@options.association_option
+@options.resolution_option
+@options.origin_option
+@options.overwrite_option
+@options.json_option
+@options.config_options
+@click.pass_context
+def command(ctx: click.Context, /, **given: Any) -> None:
+    r"""Fuse a drive into a semantic map.
+
+    \b
+    Examples:
+      hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
+      hdmap build path/to/drive -o map --association sparse --resolution 0.1
+
+    The map is a versioned repository of counts; read it with `hdmap vectorize`,
+    `hdmap compare` and `hdmap info`, add maps with `hdmap merge`.
+    """
+    from hdmap_tools.pipeline import Steps, build_alone
+
+    config = options.resolve_config(
+        given["config_path"],
+        given["settings"],
+        cameras=given["cameras"],
+        origin=given["origin"],
+        drive__layout=given["layout"],
+        segmentation__model=given["model"],
+        segmentation__profile=given["profile"],
+        segmentation__labels=given["labels"],
+        segmentation__label_set=given["label_set"],
+        association__method=given["association"],
+        association__also=[],
+        export__formats=[],
+        fusion__resolution_m=given["resolution"],
+    )
+    with options.ImageProgress(ctx.obj["progress"]) as segmented:
+        report = build_alone(
+            given["drive"],
+            given["out"],
+            config,
+            scene=given["scene"],
+            cache=options.label_cache(given["cache_folder"], given["no_cache"]),
+            overwrite=given["overwrite"],
+            steps=Steps(segmented),
+        )
+    options.write_json(given["json_path"], report)
+    click.echo(
+        f"{report['drive']}: {report['num_images']} images fused into {report['num_tiles']} tiles at "
+        f"{given['out']} in {sum(report['seconds'].values()):.1f} s"
+    )

@@ -1,0 +1,61 @@
+"""`hdmap compare`: a semantic map against a reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from hdmap_tools.cli import options
+
+
+@click.command()
+@click.argument("candidate", type=options.PATH)
+@click.argument("reference", type=options.PATH)
+@click.option("--picture", type=options.PATH, help="PNG of agreement, misses and false alarms.")
+@click.option(
+    "--drive", type=options.PATH, help="The drive; only cells near its path are compared (40 m)."
+)
+@click.option("--max-range", type=float, help="How near to the driven path, metres [default: 40].")
+@click.option("--confusion", type=options.PATH, help="Confusion matrix to read the map with.")
+@options.drive_options
+@options.json_option
+@options.config_options
+def command(**given: Any) -> None:
+    r"""Hold a semantic map against a reference, where the map has evidence.
+
+    \b
+    Examples:
+      hdmap compare out/semantic_map drivable_mask.png --picture agreement.png
+      hdmap compare map reference.osm --json scores.json
+
+    CANDIDATE is a semantic map; REFERENCE a mask PNG with its JSON, or a vector map.
+    """
+    from hdmap_tools.pipeline import compare_alone
+
+    config = options.resolve_config(
+        given["config_path"],
+        given["settings"],
+        cameras=given["cameras"],
+        drive__layout=given["layout"],
+        compare__max_range_m=given["max_range"],
+        observation__confusion=given["confusion"],
+    )
+    comparison = compare_alone(
+        given["candidate"],
+        given["reference"],
+        config,
+        drive_path=given["drive"],
+        scene=given["scene"],
+        picture=given["picture"],
+    )
+    options.write_json(given["json_path"], comparison.to_json())
+    click.echo(
+        f"{comparison.num_cells} cells ({comparison.area_m2:.0f} m2) against {comparison.reference}"
+    )
+    for name, score in comparison.groups.items():
+        figures = {"IoU": score.iou, "recall": score.recall, "precision": score.precision}
+        shown = ", ".join(f"{k} {'-' if v is None else f'{v:.3f}'}" for k, v in figures.items())
+        click.echo(f"{name}: {shown}")
+    if comparison.miou is not None:
+        click.echo(f"mIoU {comparison.miou:.3f}")

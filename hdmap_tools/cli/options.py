@@ -1,0 +1,223 @@
+"""Options that several commands share, and what they do with them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from hdmap_tools.config import Config
+    from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+PATH = click.Path(path_type=Path)
+
+
+def config_options(function: F) -> F:
+    """--config and --set."""
+    function = click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="STEP.FIELD=VALUE",
+        help="Set one field of the configuration, for example fusion.resolution_m=0.1; repeatable.",
+    )(function)
+    return click.option("--config", "config_path", type=PATH, help="hdmap.yaml to start from.")(
+        function
+    )
+
+
+def drive_options(function: F) -> F:
+    """--layout, --scene and --camera."""
+    for option in (
+        click.option(
+            "--camera", "cameras", multiple=True, help="Use only this camera; repeatable."
+        ),
+        click.option("--scene", help="Which drive of a data root: nuScenes scene, AV2 log."),
+        click.option(
+            "--layout", help="Layout of the drive, where it is not recognized: nuscenes, av2."
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def segmentation_options(function: F) -> F:
+    """--model, --profile, --labels, --label-set, --cache and --no-cache."""
+    for option in (
+        click.option(
+            "--no-cache", is_flag=True, help="Neither use nor keep label images of earlier runs."
+        ),
+        click.option("--cache", "cache_folder", type=PATH, help="Folder for kept label images."),
+        click.option("--label-set", help="What the ids in those PNGs mean: a name or a JSON file."),
+        click.option(
+            "--labels", type=PATH, help="Folder of label PNGs, CAMERA/TIMESTAMP_NS.png, instead."
+        ),
+        click.option(
+            "--profile", help="How to feed the model, where it is not known: name or JSON file."
+        ),
+        click.option(
+            "--model",
+            type=PATH,
+            help="ONNX or OpenVINO model [default: found in models/ by the drive].",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def association_option(function: F) -> F:
+    """--association."""
+    return click.option(
+        "--association",
+        type=click.Choice(["surface", "sparse", "planar"]),
+        help="How labels reach the ground [default: surface].",
+    )(function)
+
+
+def resolution_option(function: F) -> F:
+    """--resolution."""
+    return click.option("--resolution", type=float, help="Cell size, metres [default: 0.2].")(
+        function
+    )
+
+
+def origin_option(function: F) -> F:
+    """--origin."""
+    return click.option(
+        "--origin",
+        metavar="LAT,LON[,ALT]",
+        help="Place of the city origin on earth, where the data does not say it.",
+    )(function)
+
+
+def overwrite_option(function: F) -> F:
+    """--overwrite."""
+    return click.option("--overwrite", is_flag=True, help="Replace an earlier result.")(function)
+
+
+def json_option(function: F) -> F:
+    """--json."""
+    return click.option("--json", "json_path", type=PATH, help="Also write the figures as JSON.")(
+        function
+    )
+
+
+def resolve_config(
+    config_path: Path | None,
+    settings: tuple[str, ...] = (),
+    *,
+    cameras: tuple[str, ...] = (),
+    origin: str | None = None,
+    **overrides: Any,
+) -> Config:
+    """The configuration from a file, --set, and a command's own options (these win).
+
+    Args:
+        config_path: hdmap.yaml, or None.
+        settings: ``step.field=value`` texts; values are read as YAML.
+        cameras: Of --camera.
+        origin: Of --origin.
+        overrides: Values by dotted name with ``__`` for the dot; None is not given.
+    """
+    import yaml
+
+    from hdmap_tools.config import load_config
+    from hdmap_tools.errors import ConfigError
+
+    dotted: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        if not equals or not name.strip():
+            raise ConfigError(f"--set {setting!r}: expected STEP.FIELD=VALUE.")
+        try:
+            dotted[name.strip()] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {setting!r}: the value is not YAML: {error}") from error
+    for name, value in overrides.items():
+        if value is not None:
+            dotted[name.replace("__", ".")] = str(value) if isinstance(value, Path) else value
+    if cameras:
+        dotted["drive.cameras"] = list(cameras)
+    if origin is not None:
+        dotted["export.origin"] = parse_origin(origin)
+    return load_config(config_path, dotted)
+
+
+def parse_origin(text: str) -> list[float]:
+    """LAT,LON[,ALT] as three numbers.
+
+    Raises:
+        ConfigError: If it is not two or three numbers.
+    """
+    from hdmap_tools.errors import ConfigError
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (2, 3):
+        raise ConfigError(
+            f"--origin {text!r}: expected LAT,LON or LAT,LON,ALT in degrees and metres, for example "
+            "49.0123,8.4321,115."
+        )
+    return [*numbers, 0.0][:3]
+
+
+def label_cache(cache_folder: Path | None, no_cache: bool) -> LabelCache | None:
+    """The label cache asked for."""
+    from hdmap_tools.segmentation.cache import LabelCache
+
+    return None if no_cache else LabelCache(cache_folder)
+
+
+class ImageProgress:
+    """A progress bar over images on stderr, only where a person is watching."""
+
+    def __init__(self, enabled: bool) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
+
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not (enabled and console.is_terminal),
+        )
+        self._task = self._progress.add_task("images", total=None)
+
+    def __enter__(self) -> SegmentProgress:
+        self._progress.start()
+        return self._told
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def _told(self, done: int, total: int) -> None:
+        self._progress.update(self._task, completed=done, total=total)
+
+
+def write_json(path: Path | None, document: Any) -> None:
+    """Write a --json file, whole or not at all; an older one is replaced."""
+    if path is None:
+        return
+    from hdmap_tools.formats.atomic import atomic_output
+
+    text = document if isinstance(document, str) else json.dumps(document, indent=2) + "\n"
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,62 @@
+"""`hdmap segment`: label images of a drive."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from hdmap_tools.cli import options
+
+
+@click.command()
+@click.argument("drive", type=options.PATH)
+@click.option("-o", "--out", type=options.PATH, required=True, help="Folder to make.")
+@options.drive_options
+@options.segmentation_options
+@options.overwrite_option
+@options.json_option
+@options.config_options
+@click.pass_context
+def command(ctx: click.Context, /, **given: Any) -> None:
+    r"""Write label images of a drive's images.
+
+    \b
+    Examples:
+      hdmap segment path/to/drive -o labels --model road-segmentation-adas-0001.xml
+      hdmap run path/to/drive -o out --labels labels --label-set adas-0001
+
+    Writes OUT/CAMERA/TIMESTAMP_NS.png (uint8 ids) and OUT/label_set.json.
+    """
+    from hdmap_tools.label_folder import write_label_folder
+    from hdmap_tools.readers.open_drive import open_drive
+    from hdmap_tools.segmentation.open_segmenter import open_segmenter
+
+    config = options.resolve_config(
+        given["config_path"],
+        given["settings"],
+        cameras=given["cameras"],
+        drive__layout=given["layout"],
+        segmentation__model=given["model"],
+        segmentation__profile=given["profile"],
+        segmentation__labels=given["labels"],
+        segmentation__label_set=given["label_set"],
+    )
+    drive = open_drive(given["drive"], config.drive.layout, given["scene"], config.drive.cameras)
+    segmenter = open_segmenter(config.segmentation, drive)
+    with options.ImageProgress(ctx.obj["progress"]) as segmented:
+        report = write_label_folder(
+            drive,
+            segmenter,
+            given["out"],
+            config,
+            cache=options.label_cache(given["cache_folder"], given["no_cache"]),
+            overwrite=given["overwrite"],
+            progress=segmented,
+        )
+    options.write_json(given["json_path"], report)
+    shares = ", ".join(f"{name} {share:.1%}" for name, share in report["pixel_share"].items())
+    click.echo(
+        f"{report['num_images']} label images of {segmenter.name} ({segmenter.label_set.name}) in "
+        f"{given['out']}, {report['ms_per_image']:.0f} ms an image: {shares}"
+    )

@@ -1,0 +1,60 @@
+"""Label images as a folder: what `hdmap segment` writes and `--labels` reads."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdmap_tools.config import Config
+from hdmap_tools.errors import DriveError
+from hdmap_tools.output_folder import MARKER, output_folder
+from hdmap_tools.readers.drive import Drive
+from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
+from hdmap_tools.segmentation.label_png import write_label_png
+from hdmap_tools.segmentation.segmenter import Segmenter
+
+
+def write_label_folder(
+    drive: Drive,
+    segmenter: Segmenter,
+    out: Path,
+    config: Config,
+    *,
+    cache: LabelCache | None = None,
+    overwrite: bool = False,
+    progress: SegmentProgress | None = None,
+) -> dict[str, Any]:
+    """Segment all images of a drive and write their label images.
+
+    Returns:
+        Number of images, share of pixels by label, milliseconds an image.
+
+    Raises:
+        DriveError: If the drive has no images.
+    """
+    if not drive.images:
+        raise DriveError(f"Drive {drive.name} in {drive.root} has no images to segment.")
+    pixels = np.zeros(256, dtype=np.int64)
+    start = time.perf_counter()
+    with output_folder(out, overwrite) as folder:
+        for image, labels in segment_drive(drive, segmenter, drive.images, cache, progress):
+            path = folder / f"{image.key}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_label_png(path, labels)
+            pixels += np.bincount(labels.reshape(-1), minlength=256)
+        document = segmenter.label_set.model_dump_json(indent=2) + "\n"
+        (folder / "label_set.json").write_text(document, encoding="utf-8")
+        (folder / MARKER).write_text(config.to_yaml(), encoding="utf-8")
+    return {
+        "num_images": len(drive.images),
+        "model": segmenter.name,
+        "label_set": segmenter.label_set.name,
+        "ms_per_image": 1000 * (time.perf_counter() - start) / len(drive.images),
+        "pixel_share": {
+            name: float(pixels[i] / pixels.sum())
+            for i, name in enumerate(segmenter.label_set.names)
+        },
+    }
