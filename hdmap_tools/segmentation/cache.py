@@ -48,7 +48,9 @@ class LabelCache:
 
     def read(self, path: Path, label_set: LabelSet, size_px: tuple[int, int]) -> NDArrayByte | None:
         """The label image (height, width) uint8 kept at `path_of`, or None if there is no sound one."""
-        if not path.exists():
+        if not os.path.exists(
+            path
+        ):  # where Path.exists raises, as for a locked folder, this is False
             return None
         try:
             labels = read_label_png(path, size_px=size_px)

@@ -62,19 +62,17 @@ class ConfusionMatrix:
         about = f"Confusion matrix {self.true_set.name!r} by {self.predicted_set.name!r}"
         if counts.shape != expected:
             raise LabelError(f"{about}: counts are {counts.shape}, expected {expected}.")
-        try:
-            whole = counts.astype(np.int64, casting="unsafe")
-            fits = bool(
-                np.isfinite(counts).all() and (whole == counts).all() and (whole >= 0).all()
-            )
-        except (TypeError, ValueError, OverflowError):
-            fits = False
+        # Up to 2**53 any sum over 255 labels still fits, and each count is a float exactly.
+        fits = counts.dtype.kind in "iuf" and bool(
+            (np.isfinite(counts) & (counts >= 0) & (counts <= 2**53)).all()
+            and (counts == np.floor(counts)).all()
+        )
         if not fits:
             raise LabelError(
-                f"{about}: counts must be whole numbers of pixels, 0 or more, without NaN; "
-                f"found {counts.dtype} values."
+                f"{about}: counts must be whole numbers of pixels from 0 to 2**53, without NaN; "
+                f"found {counts.dtype} values that are not. Measure it anew."
             )
-        whole = whole.copy()
+        whole = counts.astype(np.int64)
         whole.flags.writeable = False
         object.__setattr__(self, "counts", whole)
 

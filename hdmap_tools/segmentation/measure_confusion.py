@@ -104,7 +104,7 @@ def confusion_from_folders(
         for image, mask in found:
             truth = read_mask(mask, true_set, divisor)
             truth[np.isin(truth, ignored_ids)] = IGNORE_ID
-            yield _rgb_of_size(image, truth.shape[1], truth.shape[0]), truth
+            yield read_rgb_of_size(image, truth.shape[1], truth.shape[0]), truth
 
     return measure_confusion(pairs(), segmenter.segment_rgb, true_set, segmenter.label_set, source)
 
@@ -147,7 +147,12 @@ def _matching(images: Path, masks: Path, mask_suffix: str) -> list[tuple[Path, P
     return found
 
 
-def _rgb_of_size(path: Path, width_px: int, height_px: int) -> NDArrayByte:
+def read_rgb_of_size(path: Path, width_px: int, height_px: int) -> NDArrayByte:
+    """An image (height, width, 3) uint8 RGB that must have its mask's size.
+
+    Raises:
+        ImageError: If it is damaged or of another size.
+    """
     # Only the size of this camera is read: the image must be as large as its mask.
     camera = PinholeCamera(path.stem, width_px, height_px, 1.0, 1.0, 0.0, 0.0, SE3.identity())
     return read_image(ImageRef(path.stem, 0, path), camera)
