@@ -77,8 +77,9 @@ def load_mask(path: Path) -> Mask:
     picture = _read_mask_png(path, sidecar)
     values = np.unique(picture)
     if len(values[values != 0]) > 1:
+        listed = ", ".join(map(str, values[:5])) + (" ..." if len(values) > 5 else "")
         raise FormatError(
-            f"{path} holds {len(values)} different values ({', '.join(map(str, values[:5]))} ...); expected 0 "
+            f"{path} holds {len(values)} different values ({listed}); expected 0 "
             "and one other value. Write one mask for each union of classes."
         )
     frame = MapFrame()

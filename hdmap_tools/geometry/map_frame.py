@@ -62,7 +62,8 @@ class MapFrame:
                 "-85..85 and longitude -180..180 degrees, in this order."
             )
         crs = CRS.from_proj4(
-            f"+proj=tmerc +lat_0={lat_deg!r} +lon_0={lon_deg!r} +k=1 +x_0=0 +y_0=0 "
+            # float(): the repr of a numpy number is not a number to PROJ.
+            f"+proj=tmerc +lat_0={float(lat_deg)!r} +lon_0={float(lon_deg)!r} +k=1 +x_0=0 +y_0=0 "
             "+datum=WGS84 +units=m +no_defs"
         )
         return cls(crs.to_wkt(), (0.0, 0.0, float(alt_m)), vertical_datum)
