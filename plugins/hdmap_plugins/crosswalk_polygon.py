@@ -49,7 +49,7 @@ class CrosswalkPolygonOptions(VectorizerOptions):
     gap_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.8
     fill_gap_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.3
     rectangle_iou: Annotated[float, Field(ge=0.0, le=1.0)] = 0.85
-    simplify_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.1
+    simplify_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.05
 
 
 class CrosswalkPolygon(Vectorizer):

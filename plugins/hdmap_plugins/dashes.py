@@ -19,6 +19,7 @@ class JoinRules:
     Attributes:
         max_gap: Longest gap between two dashes.
         max_dash: Longer strokes are no dashes.
+        min_gap: Shorter known gaps are wear: they neither break a dash nor make one.
         bridge_gap: Longest gap in an unbroken line (wear), over known cells only.
         min_dashes: Fewer make no rhythm.
         rhythm: Share by which dashes and gaps may differ from their median.
@@ -27,6 +28,7 @@ class JoinRules:
 
     max_gap: float
     max_dash: float
+    min_gap: float
     bridge_gap: float
     min_dashes: int
     rhythm: float
@@ -57,7 +59,8 @@ def join_strokes(strokes: list[Stroke], is_known: NDArrayBool, rules: JoinRules)
     cells. What is no dash is joined over short known gaps only.
     """
     lines: list[Line] = []
-    for row in _rows(strokes, rules):
+    for found in _rows(strokes, rules):
+        row = _fused(found, is_known, rules.min_gap)
         gaps = [_gap(a, b, is_known) for a, b in pairwise(row)]
         start = 0
         while start < len(row):
@@ -68,16 +71,37 @@ def join_strokes(strokes: list[Stroke], is_known: NDArrayBool, rules: JoinRules)
                 continue
             # Unbroken until a gap too long or unknown, or until dashes begin.
             end = start + 1
-            while (
-                end < len(row)
-                and gaps[end - 1].is_known
-                and gaps[end - 1].length <= rules.bridge_gap
-                and _dashed_run(row[end:], gaps[end:], rules) < rules.min_dashes
-            ):
+            while end < len(row) and (_dashed_run(row[end:], gaps[end:], rules) < rules.min_dashes):
                 end += 1
-            lines.append(Line(tuple(row[start:end]), False))
+            lines += [
+                Line((stroke,), False)
+                for stroke in _fused(row[start:end], is_known, rules.bridge_gap)
+            ]
             start = end
     return lines
+
+
+def _fused(row: list[Stroke], is_known: NDArrayBool, max_gap: float) -> list[Stroke]:
+    """The row with neighbours made one where only a short known gap parts them."""
+    result = row[:1]
+    for stroke in row[1:]:
+        last = result[-1]
+        gap = _gap(last, stroke, is_known)
+        if not gap.is_known or gap.length > max_gap:
+            result.append(stroke)
+            continue
+        between = _between(last, stroke)
+        width = (last.width_cells + stroke.width_cells) / 2.0
+        result[-1] = Stroke(
+            np.vstack([last.xy_cells, between, stroke.xy_cells]),
+            np.concatenate([last.mass, np.full(len(between), width), stroke.mass]),
+            # Nothing was seen there: it counts against the line's confidence.
+            np.concatenate([last.peak, np.zeros(len(between)), stroke.peak]),
+            float(np.hypot(last.scatter_cells, stroke.scatter_cells) / np.sqrt(2.0)),
+            (last.at_junction[0], stroke.at_junction[1]),
+            is_fused=True,
+        )
+    return result
 
 
 def _dashed_run(row: list[Stroke], gaps: list[_Gap], rules: JoinRules) -> int:
@@ -95,7 +119,7 @@ def _dashed_run(row: list[Stroke], gaps: list[_Gap], rules: JoinRules) -> int:
         dash = float(np.median(inner))
         dash_slack, gap_slack = rules.rhythm * dash + 2.0, rules.rhythm * gap + 2.0
         regular = (
-            gap <= rules.max_gap
+            rules.min_gap <= gap <= rules.max_gap
             and lengths.max() <= min(rules.max_dash, dash + dash_slack)
             and np.all(np.abs(inner - dash) <= dash_slack)
             and all(_fits(g, gap, dash, gap_slack) for g in gaps[: count - 1])
@@ -206,9 +230,14 @@ def stations_of(line: Line) -> tuple[NDArrayFloat, NDArrayBool]:
     """Stations along a whole line about one cell apart, and which of them are painted."""
     parts, painted = [line.strokes[0].xy_cells], [np.ones(len(line.strokes[0].xy_cells), bool)]
     for a, b in pairwise(line.strokes):
-        first, last = a.xy_cells[-1], b.xy_cells[0]
-        count = max(round(float(np.hypot(*(last - first)))) - 1, 0)
-        between = np.linspace(first, last, count + 2)[1:-1]
+        between = _between(a, b)
         parts += [between, b.xy_cells]
         painted += [np.zeros(len(between), bool), np.ones(len(b.xy_cells), bool)]
     return np.vstack(parts), np.concatenate(painted)
+
+
+def _between(a: Stroke, b: Stroke) -> NDArrayFloat:
+    """Stations about one cell apart on the straight way from one stroke to the next."""
+    first, last = a.xy_cells[-1], b.xy_cells[0]
+    count = max(round(float(np.hypot(*(last - first)))) - 1, 0)
+    return np.asarray(np.linspace(first, last, count + 2)[1:-1])

@@ -55,6 +55,7 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
         fill_gap_m: Unknown stripes (between lidar rings) up to this wide are filled.
         bridge_gap_m: An unbroken line is carried over known gaps up to this long (wear).
         max_dash_m: Longest dash.
+        min_gap_m: Shortest gap between dashes; shorter known ones are wear.
         max_gap_m: Longest gap between dashes.
         min_dashes: Fewer strokes in a row are not called dashed.
         rhythm: Share by which dashes and gaps may differ from their median.
@@ -71,11 +72,12 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
     max_width_m: Annotated[float, Field(gt=0.0, le=2.0)] = 0.45
     max_symbol_m: Annotated[float, Field(ge=0.0)] = 8.0
     min_length_m: Annotated[float, Field(ge=0.0)] = 1.0
-    spur_factor: Annotated[float, Field(ge=0.0, le=20.0)] = 2.5
+    spur_factor: Annotated[float, Field(ge=0.0, le=20.0)] = 2.0
     max_deflection_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 35.0
     fill_gap_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.3
     bridge_gap_m: Annotated[float, Field(ge=0.0)] = 0.8
     max_dash_m: Annotated[float, Field(gt=0.0)] = 8.0
+    min_gap_m: Annotated[float, Field(ge=0.0)] = 0.4
     max_gap_m: Annotated[float, Field(gt=0.0)] = 13.0
     min_dashes: Annotated[int, Field(ge=2)] = 3
     rhythm: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.35
@@ -130,6 +132,7 @@ class LaneMarkSkeleton(Vectorizer):
         rules = JoinRules(
             max_gap=options.max_gap_m / resolution,
             max_dash=options.max_dash_m / resolution,
+            min_gap=options.min_gap_m / resolution,
             bridge_gap=options.bridge_gap_m / resolution,
             min_dashes=options.min_dashes,
             rhythm=options.rhythm,
@@ -206,7 +209,7 @@ def _lane_mark(
     if length_m < max(options.min_length_m, 2.0 * resolution):
         return None
     xy, is_painted = stations_of(line)
-    if len(line.strokes) > 1:
+    if len(line.strokes) > 1 or line.strokes[0].is_fused:
         xy = smooth(
             xy, options.smooth_wavelength_m / resolution, weights=is_painted.astype(np.float64)
         )

@@ -36,6 +36,9 @@ from hdmap_tools.types import NDArrayBool, NDArrayFloat
 _STATION_CELLS = 0.5
 """Spacing of the stations that are smoothed: marching squares has about one vertex per half cell."""
 
+_SMOOTHING_SHARE = 0.7
+"""Leaving out vertices puts chords inside of every bend, so it gets the smaller share."""
+
 
 class RoadBoundaryOptions(VectorizerOptions):
     """Options of `RoadBoundaryOutline`.
@@ -47,8 +50,8 @@ class RoadBoundaryOptions(VectorizerOptions):
         min_length_m: Shorter open lines are dropped.
         fill_gap_m: Unknown stripes (between lidar rings) up to this wide are filled;
             wider ones end the boundary, for nothing is known of it there.
-        tolerance_m: The line stays this near to the outline: half of it for
-            smoothing, half for leaving out vertices.
+        tolerance_m: The line stays this near to the outline: 0.7 of it for smoothing,
+            the rest for leaving out vertices.
         smooth_wavelength_m: Wiggles shorter than this are smoothed, within the tolerance.
         kerb_min_m: Least step up from the road that makes a kerb.
         kerb_high_m: Least step of a high kerb, which a car does not drive over.
@@ -62,7 +65,7 @@ class RoadBoundaryOptions(VectorizerOptions):
     min_length_m: Annotated[float, Field(ge=0.0)] = 1.0
     fill_gap_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.3
     tolerance_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.1
-    smooth_wavelength_m: Annotated[float, Field(ge=0.0, le=20.0)] = 2.0
+    smooth_wavelength_m: Annotated[float, Field(ge=0.0, le=20.0)] = 1.5
     kerb_min_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.05
     kerb_high_m: Annotated[float, Field(gt=0.0, le=1.0)] = 0.12
     kerb_max_m: Annotated[float, Field(gt=0.0, le=2.0)] = 0.30
@@ -103,7 +106,9 @@ class RoadBoundaryOutline(Vectorizer):
                 continue
             xy = _smoothed(contour, options, resolution)
             kept = kept_by_simplification(
-                xy, options.tolerance_m / 2.0 / resolution, is_closed=contour.is_closed
+                xy,
+                (1.0 - _SMOOTHING_SHARE) * options.tolerance_m / resolution,
+                is_closed=contour.is_closed,
             )
             # The road is on the right, against the normal.
             to_road = -normals(xy)
@@ -160,7 +165,7 @@ def _without_specks(
 
 
 def _smoothed(contour: Contour, options: RoadBoundaryOptions, resolution: float) -> NDArrayFloat:
-    """Equally spaced stations of a contour, smoothed within half the tolerance."""
+    """Equally spaced stations of a contour, smoothed within its share of the tolerance."""
     xy = resample(contour.xy_cells, _STATION_CELLS)
     if options.smooth_wavelength_m <= 0.0 or options.tolerance_m <= 0.0:
         return xy
@@ -168,7 +173,7 @@ def _smoothed(contour: Contour, options: RoadBoundaryOptions, resolution: float)
         xy,
         options.smooth_wavelength_m / resolution / _STATION_CELLS,
         is_closed=contour.is_closed,
-        max_move=options.tolerance_m / 2.0 / resolution,
+        max_move=_SMOOTHING_SHARE * options.tolerance_m / resolution,
     )
 
 

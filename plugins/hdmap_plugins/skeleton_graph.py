@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any
 
 import networkx as nx
@@ -51,7 +51,8 @@ def skeleton_lines(
     graph = _branch_graph(skeleton)
     _cut_spurs(graph, half_width, spur_factor)
     _merge_near_junctions(graph, half_width, spur_factor)
-    return _resolve_junctions(graph, max_deflection_deg)
+    lines = _resolve_junctions(graph, max_deflection_deg)
+    return [piece for line in lines for piece in _split_at_corners(line)]
 
 
 def _branch_graph(skeleton: NDArrayBool) -> nx.MultiGraph[Any]:
@@ -170,6 +171,13 @@ def _merge_near_junctions(
             return
         _, a, b = min(bridges)
         a, b = min(a, b), max(a, b)
+        if _is_rung(graph, a, b):
+            while graph.has_edge(a, b):
+                graph.remove_edge(a, b)
+            for node in (a, b):
+                if graph.degree(node) == 2:
+                    _heal(graph, node)
+            continue
         xy = np.mean([graph.nodes[a]["xy"], graph.nodes[b]["xy"]], axis=0)
         graph.nodes[a]["xy"] = (float(xy[0]), float(xy[1]))
         while graph.has_edge(a, b):
@@ -184,6 +192,20 @@ def _merge_near_junctions(
         graph.remove_node(b)
         for _, _, data in graph.edges(a, data=True):
             data["path"][0 if data["start"] == a else -1] = xy
+
+
+def _is_rung(graph: nx.MultiGraph[Any], a: Any, b: Any) -> bool:
+    """Whether the bridge between two nodes stands across the lines there, as between double lines."""
+    bridge = np.subtract(graph.nodes[b]["xy"], graph.nodes[a]["xy"])
+    bridge = bridge / max(float(np.hypot(*bridge)), 1e-12)
+    for node in (a, b):
+        for _, other, data in graph.edges(node, data=True):
+            if {node, other} == {a, b}:
+                continue
+            heading = _heading_along(_oriented(data, node))
+            if abs(float(heading @ bridge)) > 0.5:
+                return False
+    return True
 
 
 def _heal(graph: nx.MultiGraph[Any], node: Any) -> None:
@@ -256,9 +278,12 @@ def _resolve_junctions(graph: nx.MultiGraph[Any], max_deflection_deg: float) -> 
 
 
 def _heading(branches: list[Any], end: tuple[int, int]) -> NDArrayFloat:
-    """Direction in which a branch leaves its node, over its first dozen cells."""
     path: NDArrayFloat = branches[end[0]][2]["path"]
-    path = path if end[1] == 0 else path[::-1]
+    return _heading_along(path if end[1] == 0 else path[::-1])
+
+
+def _heading_along(path: NDArrayFloat) -> NDArrayFloat:
+    """Direction in which a path leaves its first point, over its first dozen cells."""
     chord: NDArrayFloat = path[min(len(path) - 1, 12)] - path[0]
     return chord / max(float(np.hypot(*chord)), 1e-12)
 
@@ -266,3 +291,31 @@ def _heading(branches: list[Any], end: tuple[int, int]) -> NDArrayFloat:
 def _deflection_deg(leaving: NDArrayFloat, other: NDArrayFloat) -> float:
     """0 when the two branches are one straight line."""
     return float(np.degrees(np.arccos(np.clip(-leaving @ other, -1.0, 1.0))))
+
+
+def _split_at_corners(line: CellLine, reach: int = 6, corner_deg: float = 50.0) -> list[CellLine]:
+    """Pieces between sharp bends: smoothing would round them, and no lane mark has any.
+
+    They come from the corners of parking bays, and where the ends of two parallel
+    lines touch.
+    """
+    xy = line.xy_cells
+    if len(xy) < 2 * reach + 1 or bool(np.all(xy[0] == xy[-1])):
+        return [line]
+    before, after = xy[reach:-reach] - xy[: -2 * reach], xy[2 * reach :] - xy[reach:-reach]
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.abs(np.degrees(np.arctan2(cross, np.einsum("nk,nk->n", before, after))))
+    cuts = []
+    while turn.size and turn.max() > corner_deg:
+        worst = int(np.argmax(turn))
+        cuts.append(worst + reach)
+        turn[max(worst - reach, 0) : worst + reach + 1] = 0.0
+    bounds = [0, *sorted(cuts), len(xy) - 1]
+    return [
+        CellLine(
+            xy[a : b + 1],
+            (line.at_junction[0] and a == 0, line.at_junction[1] and b == len(xy) - 1),
+        )
+        for a, b in pairwise(bounds)
+        if b > a
+    ]
