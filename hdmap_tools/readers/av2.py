@@ -28,7 +28,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -135,7 +136,8 @@ def read_av2(
             for time_ns, path in image_files.get(name, [])
         ),
         sweeps=tuple(sweeps),
-        read_sweep=_sweep_reader(None if is_compensated else trajectory),
+        # partial, not a closure: a drive can then be sent to another process.
+        read_sweep=partial(read_av2_sweep, trajectory=None if is_compensated else trajectory),
         reference_maps=maps,
         warnings=tuple(warnings),
     )
@@ -175,10 +177,6 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
         intensity=to_bytes(kept["intensity"], "intensity", ref.path),
         ring=to_bytes(ring, "laser_number", ref.path),
     )
-
-
-def _sweep_reader(trajectory: Trajectory | None) -> Callable[[SweepRef], Sweep]:
-    return lambda ref: read_av2_sweep(ref, trajectory)
 
 
 def _read_trajectory(path: Path, warnings: list[str]) -> Trajectory:

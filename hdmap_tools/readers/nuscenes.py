@@ -19,6 +19,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -159,7 +160,8 @@ def read_nuscenes(
         cameras=chosen,
         images=tuple(images),
         sweeps=tuple(sweeps),
-        read_sweep=lambda ref: read_nuscenes_sweep(ref, mounts[ref.path]),
+        # partial, not a closure: a drive can then be sent to another process.
+        read_sweep=partial(_read_mounted_sweep, mounts=mounts),
         reference_maps=references,
         warnings=tuple(warnings),
     )
@@ -194,6 +196,10 @@ def read_nuscenes_sweep(ref: SweepRef, ego_SE3_lidar: SE3) -> Sweep:
         intensity=to_bytes(values[:, 3], "intensity", ref.path),
         ring=to_bytes(values[:, 4], "ring", ref.path),
     )
+
+
+def _read_mounted_sweep(ref: SweepRef, mounts: Mapping[Path, SE3]) -> Sweep:
+    return read_nuscenes_sweep(ref, mounts[ref.path])
 
 
 def _row_of(rows: Mapping[str, Row], token: str, table: str, folder: Path) -> Row:

@@ -55,6 +55,10 @@ def test_every_kind_of_jpeg_is_read(name: str, tmp_path: Path) -> None:
     assert read_image(ref_to(tmp_path / "a.jpg"), CAMERA).shape == (64, 96, 3)
 
 
+def test_fill_bytes_before_a_marker_are_allowed() -> None:
+    assert find_damage(BASELINE[:2] + b"\xff\xff" + BASELINE[2:]) is None
+
+
 def test_a_grey_image_becomes_three_equal_channels(tmp_path: Path) -> None:
     grey = noise_rgb()[:, :, 0]
     cv2.imwrite(str(tmp_path / "a.png"), grey)

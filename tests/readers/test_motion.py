@@ -14,12 +14,16 @@ SPEED_M_S, TURN_RAD_S = 15.0, 0.6
 
 
 def true_pose(offset_ns: int) -> SE3:
-    """On a circle, far from the city origin, pitching a little."""
+    """On a circle, far from the city origin, on a slope across the city's axes, pitching a little.
+
+    The slope keeps the pose at time 0 from being a mere shift, and the turns from commuting.
+    """
     t = offset_ns / 1e9
     yaw, radius = TURN_RAD_S * t, SPEED_M_S / TURN_RAD_S
     pitch = SE3.from_quaternion(np.cos(0.01 * t), 0.0, np.sin(0.01 * t), 0.0, np.zeros(3))
     xyz = (5000 + radius * np.sin(yaw), 2000 + radius * (1 - np.cos(yaw)), 60.0)
-    return SE3.from_yaw(yaw, xyz) @ pitch
+    slope = SE3.from_quaternion(0.95, 0.1, -0.2, 0.2, np.zeros(3))
+    return SE3(np.eye(3), np.array(xyz)) @ slope @ SE3.from_yaw(yaw) @ pitch
 
 
 def true_trajectory(offsets_ns: np.ndarray) -> Trajectory:

@@ -1,8 +1,10 @@
 """The layout is guessed from the folder, and what cannot be guessed is explained."""
 
+import pickle
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hdmap_tools.errors import CalibrationError, DriveError, ShapeError
@@ -32,6 +34,17 @@ def test_the_same_drive_in_both_layouts_is_the_same(av2_log: Path, nuscenes_root
     a, b = open_drive(av2_log), open_drive(nuscenes_root)
     assert [i.key for i in a.images] == [i.key for i in b.images]
     assert [s.timestamp_ns for s in a.sweeps] == [s.timestamp_ns for s in b.sweeps]
+
+
+def test_a_drive_can_be_sent_to_another_process(av2_log: Path, nuscenes_root: Path) -> None:
+    for path in (av2_log, nuscenes_root):
+        drive = open_drive(path)
+        drive.frame.to_wgs84(np.zeros((1, 3)))  # fills what the frame caches
+        sent = pickle.loads(pickle.dumps(drive))
+        ref = drive.sweeps[2]
+        np.testing.assert_array_equal(
+            sent.read_sweep(ref).points_ego, drive.read_sweep(ref).points_ego
+        )
 
 
 def test_several_logs_need_a_choice(made: Any, tmp_path: Path) -> None:
