@@ -124,10 +124,12 @@ def load_reference(
             classes=classes,
             assume_same_frame=assume_same_frame,
         )
-    from hdmap_tools.compare.vector_reference import read_vector_map, reference_from_vector_map
+    from hdmap_tools.compare.vector_reference import reference_from_vector_map
+    from hdmap_tools.formats.by_name import read_vector_map
 
     return reference_from_vector_map(
-        read_vector_map(path, grid.frame),
+        # In the file's own frame: how that reaches the map's is decided and told here.
+        read_vector_map(path),
         grid,
         source=path.name,
         min_share=min_share,

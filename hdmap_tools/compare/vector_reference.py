@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -72,8 +71,8 @@ def reference_from_vector_map(
 
     Groups, each only where the map has such elements: ``crosswalk``; ``lane_mark``
     (lines and stop lines widened to their paint; the gaps of dashed lines count as
-    paint, because maps draw them through); ``drivable`` (closed road boundaries minus
-    islands, and lanelets for vehicles); ``road`` (drivable ground without paint, when
+    paint, because maps draw them through); ``drivable`` (lanelets for vehicles or, in a
+    map without any, closed road boundaries minus islands); ``road`` (drivable ground without paint, when
     the map has paint); ``sidewalk``; ``vegetation``. The whole grid counts as covered:
     a vector map does not say where it ends.
 
@@ -179,13 +178,12 @@ def _widened(line: BaseGeometry, width_m: float) -> BaseGeometry:
 
 
 def _road_areas(vector_map: VectorMap) -> list[BaseGeometry]:
-    rings = [
-        (Polygon(shapely.get_coordinates(b.geometry)), b.is_island)
-        for b in vector_map.of_type(RoadBoundary)
-        if b.geometry.is_closed and len(b.geometry.coords) >= 4
-    ]
-    islands = shapely.union_all([shapely.make_valid(p) for p, is_island in rings if is_island])
-    outer = shapely.union_all([shapely.make_valid(p) for p, is_island in rings if not is_island])
+    """Ground for vehicles: lanelets where the map has some, else closed boundaries.
+
+    Not both: closed kerbs and edges of a map with lanelets are traffic islands and
+    parking areas (2,400 m2 of them beside 19,100 m2 of lanelets in the Karlsruhe
+    example map of Lanelet2).
+    """
     lines = {element.id: element.geometry for element in vector_map}
     lanes = []
     for lanelet in vector_map.of_type(Lanelet):
@@ -197,8 +195,17 @@ def _road_areas(vector_map: VectorMap) -> list[BaseGeometry]:
             left = left[::-1] if lanelet.is_left_reversed else left
             right = right[::-1] if lanelet.is_right_reversed else right
             lanes.append(shapely.make_valid(Polygon(np.concatenate([left, right[::-1]]))))
-    area = shapely.union_all([shapely.difference(outer, islands), *lanes])
-    return [area] if not area.is_empty else []
+    if lanes:
+        return lanes
+    rings = [
+        (shapely.make_valid(Polygon(shapely.get_coordinates(b.geometry))), b.is_island)
+        for b in vector_map.of_type(RoadBoundary)
+        if b.geometry.is_closed and len(b.geometry.coords) >= 4
+    ]
+    islands = shapely.union_all([ring for ring, is_island in rings if is_island])
+    outer = shapely.union_all([ring for ring, is_island in rings if not is_island])
+    area = shapely.difference(outer, islands)
+    return [] if area.is_empty else [area]
 
 
 def _taken_over(geometry: BaseGeometry, source: MapFrame, city: MapFrame) -> BaseGeometry:
@@ -207,14 +214,3 @@ def _taken_over(geometry: BaseGeometry, source: MapFrame, city: MapFrame) -> Bas
         return city.from_wgs84(source.to_wgs84(points))[:, :2]
 
     return shapely.transform(geometry, move)
-
-
-def read_vector_map(path: Path, frame: MapFrame) -> VectorMap:
-    """Read a vector map in any format of the package.
-
-    Raises:
-        FormatError: If the file is of no format that can be read.
-    """
-    raise FormatError(
-        f"Reference {path} is of no readable kind; expected a mask .png with a .json beside it."
-    )

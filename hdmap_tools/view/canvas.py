@@ -95,6 +95,8 @@ def paint_cells(
         viewport: What to show.
         outside: Colour beyond the grid.
     """
+    if colors.size == 0:
+        return np.full((*viewport.shape, 3), outside, dtype=np.uint8)
     cell_px = grid.resolution_m * viewport.pixels_per_metre
     factor = int(np.clip(np.ceil(1.0 / cell_px - 1e-9), 1, _MAX_OVERSAMPLING))
     fine = Viewport(viewport.bounds_m, viewport.pixels_per_metre * factor)

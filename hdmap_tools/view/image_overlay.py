@@ -67,7 +67,7 @@ def project_window_into_image(
     if window is not None:
         _paint_cells(picture, window, camera, city_SE3_ego, opacity, max_range_m)
     if vector_map is not None:
-        width = line_width_px or max(camera.width_px / 600.0, 1.0)
+        width = line_width_px or max(camera.width_px / 400.0, 1.0)
         _draw_vectors(picture, vector_map, camera, city_SE3_ego, width, max_range_m)
     return picture
 

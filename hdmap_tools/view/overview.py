@@ -133,7 +133,7 @@ def overview_picture(
     bounds_m: tuple[float, float, float, float] | None = None,
     title: str = "",
     panel_px: int = 900,
-    image_height_px: int = 420,
+    image_height_px: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write one page: camera images above, maps side by side below, legend at the foot.
@@ -149,7 +149,7 @@ def overview_picture(
         bounds_m: What to show; None shows all cells with evidence.
         title: On top.
         panel_px: About the largest side of a map, pixels.
-        image_height_px: Height of the images, pixels.
+        image_height_px: Height of the images, pixels; None makes them as wide as the maps.
         overwrite: Replace an existing file.
 
     Raises:
@@ -179,7 +179,7 @@ def overview_page(
     bounds_m: tuple[float, float, float, float] | None = None,
     title: str = "",
     panel_px: int = 900,
-    image_height_px: int = 420,
+    image_height_px: int | None = None,
 ) -> NDArrayByte:
     """The page of `overview_picture` as (height, width, 3) uint8 RGB."""
     if not panels:
@@ -198,7 +198,9 @@ def overview_page(
         )
         for panel in panels
     ]
-    photos = [TitledPicture(i.title, _resized(i, image_height_px)) for i in images]
+    map_width_px = sum(m.picture.shape[1] for m in maps)
+    height_px = image_height_px or _image_height(images, map_width_px)
+    photos = [TitledPicture(i.title, _resized(i, height_px)) for i in images]
     legend = map_legend(panels, has_path=trajectory_xy is not None or city_SE3_ego is not None)
     return compose([photos, maps], legend, title=title)
 
@@ -269,6 +271,14 @@ def _coordinates(element: MapElement) -> list[NDArrayFloat]:
     if element.geometry_type == "Polygon":
         return [shapely.get_coordinates(r) for r in (geometry.exterior, *geometry.interiors)]
     return [shapely.get_coordinates(geometry)]
+
+
+def _image_height(images: Sequence[CameraPicture], width_px: int) -> int:
+    """Height at which all images side by side are so wide, within reason."""
+    proportion = sum(
+        np.shape(i.image)[1] / np.shape(i.image)[0] for i in images if np.size(i.image)
+    )
+    return int(np.clip(width_px / max(proportion, 0.1), 240, 720))
 
 
 def _resized(camera: CameraPicture, height_px: int) -> NDArrayByte:

@@ -1,10 +1,15 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
 from shapely.geometry import LineString, Polygon
 
+from hdmap_tools.compare.raster import compare_raster
+from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.compare.vector_reference import reference_from_vector_map
 from hdmap_tools.errors import CRSMismatchError, FormatError
+from hdmap_tools.formats.by_name import read_vector_map, write_vector_map
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import (
@@ -17,8 +22,10 @@ from hdmap_tools.map_model.elements import (
     RoadBoundary,
     SidewalkArea,
     StopLine,
+    VirtualBoundary,
 )
 from hdmap_tools.map_model.vector_map import VectorMap, with_stable_ids
+from hdmap_tools.testing.scenes import window_from_posterior
 
 GRID = BevGrid(0.2, 0, 0, 50, 50)  # 10 m x 10 m
 ORIGIN = (49.0, 8.4)
@@ -110,6 +117,17 @@ def test_lanelets_make_the_road_whichever_way_their_bounds_run() -> None:
     assert names == ["lane_mark"]
 
 
+def test_closed_kerbs_of_a_map_with_lanelets_are_not_road() -> None:
+    bounds = [
+        VirtualBoundary(id="l", geometry=line((1, 6), (9, 6))),
+        VirtualBoundary(id="r", geometry=line((1, 3), (9, 3))),
+    ]
+    lane = Lanelet(id="a", geometry=line((1, 4.5), (9, 4.5)), left_id="l", right_id="r")
+    parking = RoadBoundary(geometry=LineString(ring(2, 7, 8, 9)))
+    reference = reference_from_vector_map(map_of(*bounds, lane, parking), GRID)
+    np.testing.assert_array_equal(reference.group("drivable").truth, cells(5, 15, 45, 30))
+
+
 def test_areas_beside_the_road_are_groups_of_their_own() -> None:
     reference = reference_from_vector_map(
         map_of(SidewalkArea(geometry=Polygon(ring(0, 8, 10, 10)))), GRID
@@ -156,3 +174,60 @@ def test_a_twisted_lanelet_is_drawn_not_raised() -> None:
     drivable = reference_from_vector_map(map_of(left, right, lane), GRID).group("drivable").truth
     assert 0 < drivable.sum() < cells(5, 15, 45, 30).sum()
     assert shapely.box(1, 3, 9, 6).area > 0.04 * drivable.sum()
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".osm", ".geojson"])
+def test_a_map_file_is_read_and_drawn_where_it_lies(suffix: str, tmp_path: Path) -> None:
+    frame = MapFrame.from_origin(*ORIGIN)
+    grid = BevGrid(0.2, 0, 0, 50, 50, frame)
+    crosswalk = Crosswalk(geometry=Polygon(ring(2, 5, 6, 5.78)))
+    path = tmp_path / f"map{suffix}"
+    write_vector_map(map_of(crosswalk, frame=frame), path)
+    reference = load_reference(path, grid)
+    np.testing.assert_array_equal(reference.group("crosswalk").truth, cells(10, 25, 30, 29))
+    assert reference.source == path.name
+
+
+@pytest.mark.parametrize("name", ["map.txt", "nothing.gpkg", "."])
+def test_what_is_no_map_file_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "map.txt").write_text("hello")
+    with pytest.raises(FormatError, match="expected"):
+        load_reference(tmp_path / name, GRID)
+
+
+@pytest.mark.realdata
+def test_a_real_map_agrees_with_itself_and_not_with_itself_moved(data_root: Path) -> None:
+    path = data_root / "lanelet2" / "mapping_example.osm"
+    x0, y0, x1, y1 = read_vector_map(path).bounds_m or (0.0, 0.0, 1.0, 1.0)
+    frame = read_vector_map(path).frame
+    grid = BevGrid.from_bounds((x0, y0, x1, y1), 0.5, frame)
+    reference = load_reference(path, grid)
+    assert {"drivable", "road", "crosswalk", "lane_mark"} <= {g.name for g in reference.groups}
+    drivable = reference.group("drivable").truth
+    # The judge: shapely's own area of all vehicle lanelets.
+    lines = {e.id: e.geometry for e in read_vector_map(path)}
+    lanes = [
+        Polygon(
+            [
+                *list(lines[lane.left_id].coords)[:: -1 if lane.is_left_reversed else 1],
+                *list(lines[lane.right_id].coords)[:: 1 if lane.is_right_reversed else -1],
+            ]
+        )
+        for lane in read_vector_map(path).of_type(Lanelet)
+        if lane.subtype in ("road", "highway", "bus_lane", "bicycle_lane", "exit", "play_street")
+    ]
+    area = shapely.union_all([shapely.make_valid(shapely.force_2d(lane)) for lane in lanes]).area
+    assert drivable.sum() * 0.25 == pytest.approx(area, rel=0.01)
+    window = window_from_posterior(
+        np.where(drivable, 0.6, 0.1)[None].repeat(5, axis=0).astype(np.float32)
+        * np.array([1, 0, 0, 0, 0], dtype=np.float32)[:, None, None]
+        + np.where(drivable, 0.1, 0.3)[None].astype(np.float32)
+        * np.array([0, 0, 0, 1, 0], dtype=np.float32)[:, None, None],
+        grid,
+    )
+    assert compare_raster(window, reference).groups["drivable"].iou == 1.0
+    moved = BevGrid(0.5, grid.x_min + 10, grid.y_min, grid.x_max + 10, grid.y_max, frame)
+    shifted = window_from_posterior(window.dataset["posterior"].values.copy(), moved)
+    score = compare_raster(shifted, load_reference(path, moved)).groups["drivable"]
+    assert score.iou is not None
+    assert score.iou < 0.8
