@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# A deadline for each example measures how busy the machine is, not our code.
+settings.register_profile("hdmap", deadline=None)
+settings.load_profile("hdmap")
 
 
 @pytest.fixture(scope="session")

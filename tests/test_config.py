@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
@@ -200,7 +200,6 @@ configs = st.builds(
 
 @given(configs)
 @example(Config(segmentation=SegmentationConfig(profile="a\x85b", model=Path("Straße.onnx"))))
-@settings(deadline=None)
 def test_a_dumped_configuration_loads_as_itself(tmp_path_factory, config: Config) -> None:
     path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8")

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import LineString, Polygon
 
@@ -40,7 +40,6 @@ def key(element: MapElement) -> tuple[str, str]:
 
 
 @given(st.lists(elements(), max_size=12), st.randoms(use_true_random=False))
-@settings(deadline=None)
 def test_ids_do_not_depend_on_the_order_of_arrival(found, rng: random.Random) -> None:
     shuffled = list(found)
     rng.shuffle(shuffled)
@@ -48,8 +47,14 @@ def test_ids_do_not_depend_on_the_order_of_arrival(found, rng: random.Random) ->
     assert first == sorted(key(e) for e in with_stable_ids(shuffled))
 
 
+def test_two_marks_on_one_line_are_told_apart_by_what_they_are() -> None:
+    white, yellow = (LaneMark(geometry=line(0, 0), color=c) for c in ("white", "yellow"))
+    one, other = with_stable_ids([white, yellow]), with_stable_ids([yellow, white])
+    assert {e.color: e.id for e in one} == {e.color: e.id for e in other}
+    assert one[0].id != one[1].id
+
+
 @given(st.lists(elements(), max_size=12))
-@settings(deadline=None)
 def test_ids_are_unique_and_nothing_is_lost(found) -> None:
     named = with_stable_ids(found)
     assert len(named) == len(found)
