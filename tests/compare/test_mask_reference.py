@@ -235,3 +235,28 @@ def test_the_real_mask_lies_where_its_json_says(data_root: Path) -> None:
             marked += picture[np.ix_(rows, cols)] > 0
     np.testing.assert_array_equal(reference.groups[0].truth, marked >= 2)
     assert 0.05 < reference.groups[0].truth.mean() < 0.95
+
+
+@pytest.mark.realdata
+def test_lidar_points_on_the_ground_lie_on_the_real_mask_and_others_do_not(data_root: Path) -> None:
+    """What is known of the data: most near-ground points lie on it, high ones and shifted ones do not."""
+    from hdmap_tools.readers.open_drive import open_drive
+
+    drive = open_drive(data_root / "nuscenes")
+    sweep = drive.read_sweep(drive.sweeps[0])
+    pose = drive.trajectory.interpolate(sweep.timestamp_ns, 0.5)
+    x, y = pose.translation[:2]
+    grid = BevGrid.from_bounds((x - 40, y - 40, x + 40, y + 40), 0.2, drive.frame)
+    reference = load_reference(data_root / "nuscenes" / "drivable_mask.png", grid)
+    assert reference.notes == ()  # the drive and its mask are in one frame
+    points = pose.transform_from(sweep.points_ego)
+    height = sweep.points_ego[:, 2]
+
+    def share_on_mask(rows: np.ndarray, east_m: float) -> float:
+        at = grid.rows_cols_of(points[rows, :2] + (east_m, 0.0))
+        at = at[grid.contains(at)]
+        return float(reference.groups[0].truth[at[:, 0], at[:, 1]].mean())
+
+    assert share_on_mask(np.abs(height) < 0.2, 0.0) > 0.8
+    assert share_on_mask(np.abs(height) < 0.2, 15.0) < 0.1
+    assert share_on_mask(height > 2.0, 0.0) < 0.15
