@@ -55,6 +55,13 @@ class PluginFailure:
     traceback: str = ""
     is_skipped: bool = False
 
+    def describe(self) -> str:
+        """One line for people: whose it is, what happened, what is missing."""
+        return (
+            f"vectorizer {self.name} ({self.distribution} {self.version}) gave nothing: "
+            f"{self.message.rstrip('.')}. Its elements are missing."
+        )
+
 
 @dataclass(frozen=True)
 class VectorizationResult:

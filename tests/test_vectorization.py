@@ -205,6 +205,10 @@ def test_a_failure_skips_dependants_and_nobody_else(fakes: FakePlugins, window: 
     assert (base.distribution, base.version, base.is_skipped) == ("bad-dist", "0.3", False)
     assert base.message == "ZeroDivisionError: division by zero"
     assert "1 / 0" in base.traceback
+    assert base.describe() == (
+        "vectorizer base (bad-dist 0.3) gave nothing: "
+        "ZeroDivisionError: division by zero. Its elements are missing."
+    )
     assert "requires base, which failed" in failure(result, "middle").message
     assert "requires middle, which failed" in failure(result, "top").message
     assert failure(result, "top").is_skipped
