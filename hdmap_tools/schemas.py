@@ -23,6 +23,7 @@ from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.formats.records import METADATA_VERSION
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.map_model.elements import ELEMENT_TYPES, MapElement
+from hdmap_tools.run_metrics import RunMetrics
 from hdmap_tools.segmentation.confusion import ConfusionDocument
 from hdmap_tools.segmentation.segmenter import ModelProfile
 
@@ -40,6 +41,7 @@ _MODELS: Final[tuple[tuple[str, type[BaseModel], int, _Mode], ...]] = (
     ("confusion_matrix", ConfusionDocument, 1, "validation"),
     ("mask", MaskSidecar, 1, "validation"),
     ("raster_comparison", RasterComparison, 1, "serialization"),
+    ("run_metrics", RunMetrics, 1, "serialization"),
 )
 
 

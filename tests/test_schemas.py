@@ -34,6 +34,7 @@ from hdmap_tools.map_model.elements import (
     RoadBoundary,
 )
 from hdmap_tools.map_model.vector_map import VectorMap, with_stable_ids
+from hdmap_tools.run_metrics import RunMetrics, versions
 from hdmap_tools.segmentation.segmenter import ModelProfile
 from hdmap_tools.testing.scenes import street_scene
 
@@ -136,6 +137,7 @@ def _kind(path: Path, document: Any) -> str:
         "channels": "model_profile",
         "origin_xy_m": "mask",
         "groups": "raster_comparison",
+        "comparisons": "run_metrics",
     }
     for member, kind in members.items():
         if member in document:
@@ -176,9 +178,8 @@ def test_the_default_configuration_validates(tmp_path: Path) -> None:
     assert load_config(tmp_path / "hdmap.yaml") == Config()
 
 
-def test_a_raster_comparison_validates() -> None:
-    scene = street_scene()
-    window = scene[0] if isinstance(scene, tuple) else scene
+def _comparison() -> RasterComparison:
+    window = street_scene()
     road = window.probability("road") > 0.5
     reference = Reference(
         window.grid,
@@ -187,13 +188,41 @@ def test_a_raster_comparison_validates() -> None:
         "truth",
         "drawn",
     )
-    comparison = compare_raster(window, reference)
+    return compare_raster(window, reference)
+
+
+def test_a_raster_comparison_validates() -> None:
+    comparison = _comparison()
     document = json.loads(comparison.to_json())
     assert comparison.num_cells > 0
     assert problems("raster_comparison", document) == []
     for member in RasterComparison.model_fields:
         if RasterComparison.model_fields[member].is_required():
             assert problems("raster_comparison", {k: document[k] for k in document if k != member})
+
+
+def test_run_metrics_validate() -> None:
+    metrics = RunMetrics(
+        drive="nuscenes:scene-0061",
+        model="network",
+        association="sparse",
+        resolution_m=0.2,
+        intensity_threshold=31,
+        num_images=6,
+        num_images_dropped={"no pose": 1},
+        num_tiles=4,
+        num_elements={"lane_mark": 12},
+        plugins=[{"name": "lane_mark_skeleton", "version": "0.1.0", "options": {}}],
+        failures={},
+        comparisons={"sparse": _comparison()},
+        seconds={"segmentation": 1.5},
+        warnings=("one sweep was truncated",),
+        versions=versions(),
+    )
+    document = json.loads(metrics.to_json())
+    assert problems("run_metrics", document) == []
+    document["comparisons"]["sparse"]["miou"] = 1.5
+    assert problems("run_metrics", document)
 
 
 # The map as GeoJSON

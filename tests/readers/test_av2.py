@@ -66,6 +66,7 @@ def test_everything_written_comes_back(av2_log: Path, made: Any) -> None:
 
 
 def test_the_data_sets_own_package_reads_the_same(av2_log: Path) -> None:
+    pytest.importorskip("av2", reason="av2 has no wheel for this Python")
     from av2.geometry.camera.pinhole_camera import PinholeCamera as TheirCamera
     from av2.structures.sweep import Sweep as TheirSweep
     from av2.utils.io import read_city_SE3_ego
@@ -103,6 +104,7 @@ def test_the_published_lens_is_applied_only_to_raw_images(made: Any, tmp_path: P
 def test_the_city_frame_agrees_with_the_data_sets_own_package(
     city: str, made: Any, tmp_path: Path
 ) -> None:
+    pytest.importorskip("av2", reason="av2 has no wheel for this Python")
     from av2.geometry.utm import CityName, convert_city_coords_to_utm, convert_city_coords_to_wgs84
 
     frame = read_av2(made.write_av2(tmp_path / "log", city=city)).frame
