@@ -21,7 +21,7 @@ from shapely.geometry import LineString, Polygon, mapping
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from hdmap_tools.errors import FormatError
+from hdmap_tools.errors import CRSMismatchError, FormatError
 from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.formats.records import (
     Skipped,
@@ -237,12 +237,10 @@ def _oriented(element: MapElement) -> MapElement:
 
 
 def _feature(element: MapElement, frame: MapFrame) -> dict[str, Any]:
-    geometry = map_geometry(element.geometry, lambda c: _rounded(frame.to_wgs84(c)))
-    if not np.isfinite(shapely.get_coordinates(geometry, include_z=True)).all():
-        raise FormatError(
-            f"{element.element_type} {element.id!r} lies where {frame.describe()} has no longitude "
-            "and latitude; check its coordinates and the origin."
-        )
+    try:
+        geometry = map_geometry(element.geometry, lambda c: _rounded(frame.to_wgs84(c)))
+    except CRSMismatchError as error:
+        raise FormatError(f"{element.element_type} {element.id!r}: {error}") from error
     document = mapping(geometry)
     properties = {"element_type": element.element_type, **element_fields(element)}
     return {

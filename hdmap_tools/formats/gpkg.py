@@ -46,8 +46,10 @@ ROUND_TRIP_M: Final = 1e-9
 """What adding and taking away an offset of up to 10 000 km costs in float64."""
 
 _METADATA_KEY: Final = "hdmap_tools"
-_DETERMINISTIC: Final = {"OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z"}
-"""GDAL writes this in place of the time of day."""
+_GDAL_SETTINGS: Final = {
+    "OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z",  # written in place of the time of day
+    "OGR_SQLITE_SYNCHRONOUS": "OFF",  # the finished file is synced once, before its rename
+}
 _gdal_lock = threading.Lock()  # GDAL's configuration is one for the whole process
 
 
@@ -272,8 +274,8 @@ def _pyogrio_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     )
 
     with _gdal_lock:
-        before = {key: pyogrio.get_gdal_config_option(key) for key in _DETERMINISTIC}
-        pyogrio.set_gdal_config_options(_DETERMINISTIC)
+        before = {key: pyogrio.get_gdal_config_option(key) for key in _GDAL_SETTINGS}
+        pyogrio.set_gdal_config_options(_GDAL_SETTINGS)
         try:
             yield
         except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError) as error:

@@ -10,9 +10,10 @@ from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
 from hdmap_tools.geometry.polyline import arc_lengths
-from hdmap_tools.types import NDArrayBool, NDArrayFloat
+from hdmap_tools.types import NDArrayFloat
 
-_MAX_SPLITS_TRIED = 200
+_MAX_CUTS_TRIED = 200
+_MAX_VERTICES_ADDED = 3
 
 
 def are_reversed(left: NDArrayFloat, right: NDArrayFloat) -> tuple[bool, bool]:
@@ -46,18 +47,27 @@ def split_crosswalk(polygon: Polygon) -> tuple[NDArrayFloat, NDArrayFloat] | Non
     """Left and right chain (N, 3) of a crossing's outline, running the same way.
 
     The outline is cut at its two ends along its longer axis: the edges there belong to
-    neither chain, every vertex to one of them. A triangle gets a vertex in the middle of
-    its longest edge. Returns None if no cut gives two sides that a reader can tell apart.
+    neither chain, every vertex to one of them. Where that cannot be done (a triangle, a
+    dart) the longest edge gets a vertex in its middle, which leaves the shape as it is.
+    Returns None if no cut gives two sides that a reader can tell apart.
     """
     ring = shapely.get_coordinates(orient(polygon, 1.0).exterior, include_z=True)[:-1]
-    if len(ring) == 3:
+    axis = _long_axis(polygon)
+    for _ in range(1 + _MAX_VERTICES_ADDED):
+        sides = _best_cut(ring, axis)
+        if sides is not None:
+            return sides
         ring = _with_midpoint(ring)
+    return None
+
+
+def _best_cut(ring: NDArrayFloat, axis: NDArrayFloat) -> tuple[NDArrayFloat, NDArrayFloat] | None:
     count = len(ring)
-    along = (ring + np.roll(ring, -1, axis=0))[:, :2] / 2.0 @ _long_axis(polygon)
+    along = (ring + np.roll(ring, -1, axis=0))[:, :2] / 2.0 @ axis
     first, second = np.triu_indices(count, k=2)
     apart = count - (second - first) >= 2
     first, second = first[apart], second[apart]
-    best = np.argsort(-np.abs(along[first] - along[second]), kind="stable")[:_MAX_SPLITS_TRIED]
+    best = np.argsort(-np.abs(along[first] - along[second]), kind="stable")[:_MAX_CUTS_TRIED]
     for i, j in zip(first[best], second[best], strict=True):
         # Counter-clockwise, so the outline's inside lies left of the chain that runs along.
         right = ring[i + 1 : j + 1]
@@ -91,11 +101,6 @@ def assemble_rings(lines: Sequence[tuple[int, ...]]) -> list[tuple[int, ...]] | 
             ring = ring + (line if line[0] == ring[-1] else line[::-1])[1:]
         rings.append(ring[:-1])
     return rings
-
-
-def has_repeats(points: NDArrayFloat) -> NDArrayBool:
-    """(N - 1,) bool: where a point equals the next one."""
-    return np.asarray((np.diff(points, axis=0) == 0.0).all(axis=1))
 
 
 def _long_axis(polygon: Polygon) -> NDArrayFloat:

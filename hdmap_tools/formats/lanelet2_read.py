@@ -92,11 +92,6 @@ class _Reader:
         ).reshape(-1, 3)
         self.frame = frame or frame_around(geographic)
         points = self.frame.from_wgs84(geographic) if len(geographic) else geographic
-        if not np.isfinite(points).all():
-            raise FormatError(
-                f"Some points cannot be converted to {self.frame.describe()}: they lie too far away; "
-                "give a frame near the map."
-            )
         self._point = dict(zip(document.nodes, points, strict=True))
         self._ids: set[str] = set()
         self._element_of_way: dict[int, str] = {}

@@ -16,7 +16,6 @@ Ids are numbered from 1 in the order of the map, so they are the same in every r
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
 from collections import Counter
@@ -29,7 +28,7 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
-from hdmap_tools.errors import FormatError
+from hdmap_tools.errors import CRSMismatchError, FormatError
 from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.formats.lanelet2_geometry import (
     are_reversed,
@@ -154,6 +153,7 @@ class _Builder:
         assert isinstance(polygon, Polygon)
         if polygon.interiors:
             self._lost["hole of a crosswalk"] += len(polygon.interiors)
+        _refuse_repeats(element, shapely.get_coordinates(polygon.exterior, include_z=True))
         sides = split_crosswalk(polygon)
         if sides is None:
             raise FormatError(
@@ -289,12 +289,7 @@ class _Builder:
         shares_ends: bool = False,
     ) -> int:
         positions = self._positions(element, points)
-        for a, b in itertools.pairwise(positions):
-            if a == b:
-                raise FormatError(
-                    f"{element.element_type} {element.id!r} has the same point twice in a row (within "
-                    f"1 µm, at latitude {a[0]}, longitude {a[1]}); remove repeated vertices first."
-                )
+        _refuse_repeats(element, np.array(positions))
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         self._num_near += int((steps < NEAR_POINTS_M).sum())
         is_closed = positions[0] == positions[-1]
@@ -318,12 +313,10 @@ class _Builder:
     def _positions(
         self, element: MapElement, points: NDArrayFloat
     ) -> list[tuple[float, float, float]]:
-        geographic = self._map.frame.to_wgs84(points)
-        if not np.isfinite(geographic).all():
-            raise FormatError(
-                f"{element.element_type} {element.id!r} lies where {self._map.frame.describe()} has no "
-                "latitude and longitude; check its coordinates and the origin."
-            )
+        try:
+            geographic = self._map.frame.to_wgs84(points)
+        except CRSMismatchError as error:
+            raise FormatError(f"{element.element_type} {element.id!r}: {error}") from error
         return [
             (
                 _decimal(lat, COORDINATE_DECIMALS),
@@ -332,6 +325,15 @@ class _Builder:
             )
             for lon, lat, ele in geographic
         ]
+
+
+def _refuse_repeats(element: MapElement, points: NDArrayFloat) -> None:
+    repeated = np.flatnonzero((np.diff(points, axis=0) == 0.0).all(axis=1))
+    if len(repeated):
+        raise FormatError(
+            f"{element.element_type} {element.id!r} has the same point twice in a row (vertices "
+            f"{repeated[0]} and {repeated[0] + 1}, within 1 µm); remove repeated vertices first."
+        )
 
 
 def _decimal(value: float, decimals: int) -> float:

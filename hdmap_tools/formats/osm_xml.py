@@ -2,8 +2,10 @@
 
 The file is fed in blocks to a parser that builds no tree, so memory is bounded by the
 primitives kept. No DTD is ever read: a DOCTYPE is refused where it begins, before any
-entity in it is declared, which rules out entity expansion and external entities. The
-parser's own limits stay on (10 MB for one tag, 256 levels).
+entity in it is declared, which rules out entity expansion and external entities. A tag,
+comment or text of more than 10 MB is refused while it is read: libxml2's own limit of that
+size does not hold for attributes fed in blocks (a 1 GB attribute went through, with 2 GB of
+memory). Its limit of 256 levels stays on.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from hdmap_tools.formats.osm_document import (
     OsmWay,
 )
 
+MAX_TAG_BYTES: Final = 10_000_000
 _BLOCK_BYTES: Final = 1 << 16
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 
@@ -39,13 +42,24 @@ def read_osm(path: str | os.PathLike[str]) -> OsmDocument:
     from lxml import etree
 
     target = _OsmTarget(str(path))
+    # "internal" is for &amp; and its kind alone, as no entity can be declared without a DOCTYPE;
+    # with False, libxml2 hands out &amp; in attributes as the five characters &#38;.
     parser = etree.XMLParser(
-        target=target, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
+        target=target, resolve_entities="internal", no_network=True, load_dtd=False, huge_tree=False
     )
     try:
         with Path(path).open("rb") as stream:
+            num_quiet_bytes = 0
             while block := stream.read(_BLOCK_BYTES):
+                before = target.num_events
                 parser.feed(block)
+                num_quiet_bytes = 0 if target.num_events > before else num_quiet_bytes + len(block)
+                if num_quiet_bytes > MAX_TAG_BYTES:
+                    raise FormatError(
+                        f"{path} cannot be read: one tag, text or comment is longer than "
+                        f"{MAX_TAG_BYTES // 1_000_000} MB, which no map needs; the file is damaged or "
+                        "made to exhaust memory."
+                    )
         parser.close()
     except HDMapError:
         raise
@@ -66,6 +80,7 @@ class _OsmTarget:
     def __init__(self, source: str) -> None:
         self.document = OsmDocument()
         self.error: FormatError | None = None
+        self.num_events = 0
         self._source = source
         self._depth = 0
         self._open: str | None = None  # the primitive we are in
@@ -81,6 +96,7 @@ class _OsmTarget:
         )
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self.num_events += 1
         self._depth += 1
         if self._depth == 1:
             if tag != "osm":
@@ -108,6 +124,7 @@ class _OsmTarget:
                 )
 
     def end(self, tag: str) -> None:
+        self.num_events += 1
         if self._depth == 2 and self._open:
             if self._attributes.get("action") == "delete":
                 self.document.num_deleted += 1

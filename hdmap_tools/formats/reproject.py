@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-import shapely
-
 from hdmap_tools.errors import CRSMismatchError
 from hdmap_tools.formats.records import map_geometry
 from hdmap_tools.geometry.map_frame import MapFrame
@@ -31,10 +28,5 @@ def reproject(vector_map: VectorMap, frame: MapFrame) -> VectorMap:
     moved = []
     for element in vector_map:
         geometry = map_geometry(element.geometry, lambda c: frame.from_wgs84(old.to_wgs84(c)))
-        if not np.isfinite(shapely.get_coordinates(geometry, include_z=True)).all():
-            raise CRSMismatchError(
-                f"{element.element_type} {element.id!r} lies outside {frame.describe()}; "
-                "give a frame near the map."
-            )
         moved.append(element.model_copy(update={"geometry": geometry}))
     return VectorMap(frame, tuple(moved), vector_map.provenance)
