@@ -97,16 +97,17 @@ def test_only_label_images_are_written(labels, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_write_leaves_the_good_file(tmp_path, monkeypatch):
+@pytest.mark.parametrize("step", ["fsync", "rename"])
+def test_a_failed_write_leaves_the_good_file(step, tmp_path, monkeypatch):
     path = tmp_path / "a.png"
     write_label_png(path, np.zeros((2, 2), np.uint8))
     good = path.read_bytes()
 
-    def full(descriptor: int) -> None:
+    def full(*args: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(*((os, "fsync") if step == "fsync" else (Path, "replace")), full)
     with pytest.raises(OSError, match="No space"):
         write_label_png(path, np.ones((2, 2), np.uint8))
     assert path.read_bytes() == good
-    assert list(Path(tmp_path).iterdir()) == [path]
+    assert list(tmp_path.iterdir()) == [path]

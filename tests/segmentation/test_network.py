@@ -57,13 +57,21 @@ def test_labels_stay_at_their_pixels_whatever_the_sizes(
 
 
 @given(blocks=blocks)
-def test_a_mirrored_image_gives_the_mirrored_labels(blocks, make_profile, paint):
+@pytest.mark.parametrize("output", ["scores", "ids"])
+@pytest.mark.parametrize("mirror", [np.s_[:, ::-1], np.s_[::-1]], ids=["sideways", "upright"])
+def test_a_mirrored_image_gives_the_mirrored_labels(mirror, output, blocks, make_profile, paint):
+    # Sizes at which no pixel centre falls on an edge of the other grid.
     rgb, _ = paint(blocks, 5)
-    profile = make_profile(input_size_px=(13, 9))
-    segmenter = NetworkSegmenter(network(scores_of, (1, 3, 9, 13)), profile, {})
+    profile = make_profile(input_size_px=(13, 9), output=output)
+
+    def run(batch):
+        scores = scores_of(batch)
+        return scores if output == "scores" else scores.argmax(axis=1)
+
+    segmenter = NetworkSegmenter(network(run, (1, 3, 9, 13)), profile, {})
     labels = segmenter.segment_rgb(rgb)
-    mirrored = segmenter.segment_rgb(np.ascontiguousarray(rgb[:, ::-1]))
-    np.testing.assert_array_equal(mirrored, labels[:, ::-1])
+    mirrored = segmenter.segment_rgb(np.ascontiguousarray(rgb[mirror]))
+    np.testing.assert_array_equal(mirrored, labels[mirror])
 
 
 def test_input_is_scaled_then_normalized_in_the_order_of_the_channels(make_profile):

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from hdmap_tools.config import SegmentationConfig
-from hdmap_tools.labels.label_set import load_label_set
+from hdmap_tools.labels.label_set import Label, LabelSet, load_label_set
 from hdmap_tools.readers.open_drive import open_drive
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
-from hdmap_tools.segmentation.measure_confusion import confusion_from_folders, read_mask
+from hdmap_tools.segmentation.measure_confusion import (
+    confusion_from_folders,
+    read_mask,
+    read_rgb_of_size,
+)
 from hdmap_tools.segmentation.open_segmenter import open_model, open_segmenter
 
 pytestmark = pytest.mark.realdata
@@ -61,8 +65,6 @@ def test_the_shipped_matrix_leaves_out_no_pixel_but_undefined_ones(data_root, me
     [("FRONT", 0.94, 0.41), ("FRONT_RIGHT", None, 0.69)],
 )
 def test_each_camera_as_well_as_known(camera, road_iou, mark_iou, data_root, segmenter):
-    from hdmap_tools.segmentation.measure_confusion import read_rgb_of_size
-
     folder = data_root / "waymo_panoptic"
     truth_set = load_label_set("waymo-panoptic")
     truth = read_mask(folder / f"{camera}_panoptic.png", truth_set, 1000)
@@ -92,3 +94,33 @@ def test_the_front_camera_sees_road_ahead_and_sky_above(data_root):
     assert (names[labels[630:655, 1005:1030]] == "mark").mean() > 0.5
     # The trees and buildings on the other side are none.
     assert not (names[labels[100:450]] == "mark").any()
+
+
+def test_a_real_onnx_model_with_a_profile_of_ones_own(data_root, make_profile, tmp_path):
+    """TwinLiteNet: one of its two outputs tells drivable ground from everything else."""
+    drivable = LabelSet(
+        name="drivable",
+        labels=(
+            Label(id=0, name="other", color=(0, 0, 0)),
+            Label(id=1, name="drivable", color=(128, 64, 128), map_class="road"),
+        ),
+    )
+    (tmp_path / "drivable.json").write_text(drivable.model_dump_json())
+    profile = make_profile(
+        name="twinlitenet",
+        label_set="drivable.json",
+        input_size_px=(640, 360),
+        output_name="da",
+    )
+    (tmp_path / "profile.json").write_text(profile.model_dump_json())
+    drive = open_drive(data_root / "nuscenes")
+    config = SegmentationConfig(
+        model=data_root / "models" / "twinlitenet" / "best.onnx",
+        profile=str(tmp_path / "profile.json"),
+    )
+    segmenter = open_segmenter(config, drive)
+    (image,) = [image for image in drive.images if image.camera == "CAM_FRONT"]
+    labels = segmenter.segment(image)
+    assert labels.shape == (900, 1600)
+    assert (labels[620:880, 500:1100] == 1).mean() > 0.95
+    assert (labels[:400] == 1).mean() < 0.001
