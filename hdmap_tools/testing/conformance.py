@@ -11,6 +11,7 @@ Both run the same functions; each takes a `Case` and raises `CheckFailedError`.
 
 from __future__ import annotations
 
+import functools
 import math
 import random
 import traceback
@@ -45,6 +46,16 @@ MOVE_TOLERANCE_M: Final = 1e-3
 """Sub-cell arithmetic in float32 far from the origin may lose this much, not more."""
 
 
+@functools.cache
+def _street() -> MapWindow:
+    return read_only(street_scene(stop_line=True))
+
+
+def default_scene() -> MapWindow:
+    """`street_scene` with a stop line; drawn once, handed out with a dataset of its own each time."""
+    return read_only(_street())
+
+
 class CheckFailedError(AssertionError):
     """A vectorizer does not keep what the contract promises."""
 
@@ -63,7 +74,7 @@ class Case:
 
     vectorizer: type[Vectorizer]
     options: Mapping[str, Any] = field(default_factory=dict)
-    scene: MapWindow = field(default_factory=lambda: street_scene(stop_line=True))
+    scene: MapWindow = field(default_factory=default_scene)
     rotation_tolerance_m: float | None = None
 
     @property
@@ -390,7 +401,7 @@ class VectorizerConformance:
 
     def scene(self) -> MapWindow:
         """A window that holds what the vectorizer looks for; override it where ours does not."""
-        return street_scene(stop_line=True)
+        return default_scene()
 
     def case(self) -> Case:
         """The vectorizer with what it is tried on."""
