@@ -1,0 +1,169 @@
+import numpy as np
+import pytest
+
+from hdmap_tools.association.ground import GroundedSweep
+from hdmap_tools.association.lookup import cell_centres_around, speaks_of_ground
+from hdmap_tools.association.planar import associate_planar, ground_plane
+from hdmap_tools.association.sparse import associate_sparse
+from hdmap_tools.association.surface import associate_surface
+from hdmap_tools.config import AssociationConfig
+from hdmap_tools.geometry.grid import cells_of
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.labels.label_set import Label, LabelSet, load_label_set
+
+from .scenes import Street, camera, distance_to_edge, flat, slope, stripes
+
+ADAS = load_label_set("adas-0001")
+CONFIG = AssociationConfig()
+BOX = (12.0, -1.5, 16.0, 1.5, 1.4)
+
+
+def observe(
+    street,
+    *,
+    pose=None,
+    sweep_pose=None,
+    method="sparse",
+    config=CONFIG,
+    cam=None,
+    lidar_height_m=1.9,
+):
+    pose = pose or SE3.identity()
+    sweep_pose = sweep_pose or pose
+    cam = cam or camera()
+    labels = street.label_image(cam, pose)
+    grounded = GroundedSweep.from_sweep(
+        street.sweep(sweep_pose, lidar_height_m=lidar_height_m), sweep_pose, 60.0, 0.1
+    )
+    if method == "sparse":
+        return associate_sparse(labels, ADAS, cam, pose, grounded, config)
+    if method == "surface":
+        return associate_surface(labels, ADAS, cam, pose, grounded, 0.2, config)
+    return associate_planar(labels, ADAS, cam, pose, ground_plane(grounded), 0.2, config)
+
+
+def agreement(observations, margin_m=0.08):
+    """Share of labels that are right, away from the edges of labels."""
+    x, y = observations.points_city[:, 0], observations.points_city[:, 1]
+    clear = distance_to_edge(y) > margin_m
+    return (observations.labels == stripes(x, y))[clear].mean()
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface", "planar"])
+def test_labels_land_where_they_are_on_flat_ground(method):
+    seen = observe(Street(flat, stripes), method=method)
+    near = seen.points_city[:, 0] < 20.0
+    assert near.sum() > 500
+    assert {1, 3} <= set(seen.labels[near].tolist())
+    assert agreement(seen) > 0.97
+    np.testing.assert_allclose(seen.points_city[near, 2], 0.0, atol=0.03)
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface"])
+def test_labels_land_where_they_are_on_a_slope(method):
+    seen = observe(Street(slope, stripes), method=method)
+    assert agreement(seen, margin_m=0.15) > 0.97
+    x, y, z = seen.points_city.T
+    assert np.sqrt(np.mean((z - slope(x, y)) ** 2)) < 0.03
+
+
+def test_the_planar_method_fails_on_a_slope_where_the_surface_does_not():
+    # A stripe across the road every 4 m: a wrong height moves it along the view.
+    across = Street(slope, lambda x, y: np.where(np.mod(x, 4.0) < 2.0, 3, 1))
+
+    def right(method):
+        seen = observe(across, method=method)
+        x = seen.points_city[:, 0]
+        use = (
+            (x > 12.0) & (np.abs(seen.points_city[:, 1]) < 5) & (np.abs(np.mod(x, 2.0) - 1.0) < 0.8)
+        )
+        return (seen.labels == np.where(np.mod(x, 4.0) < 2.0, 3, 1))[use].mean()
+
+    assert right("surface") > 0.9
+    assert right("planar") < 0.75
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface", "planar"])
+def test_the_pose_of_the_image_and_of_the_sweep_each_count(method):
+    # 15 m/s and turning: 50 ms between sweep and image are 0.75 m and 3 degrees.
+    image_pose = SE3.from_yaw(0.05, (0.75, 0.02, 0.0))
+    seen = observe(Street(flat, stripes), pose=image_pose, sweep_pose=SE3.identity(), method=method)
+    assert agreement(seen) > 0.97
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface"])
+def test_nothing_is_labelled_behind_an_obstacle(method):
+    # A lidar 2.6 m up looks over a box 1.4 m high and meets the ground 33 m ahead; to the
+    # camera, 1.5 m up, that ground is hidden.
+    def labelled_behind(occlusion_test):
+        config = AssociationConfig(
+            occlusion_test=occlusion_test, lookup_range_m=45.0, max_range_m=45.0
+        )
+        seen = observe(Street(flat, stripes, BOX), method=method, config=config, lidar_height_m=2.6)
+        x, y = seen.points_city[:, 0], seen.points_city[:, 1]
+        return ((x > 17.0) & (np.abs(y - 0.1) < 0.8 * x / 10.0)).sum()
+
+    assert labelled_behind(occlusion_test=False) > 5
+    assert labelled_behind(occlusion_test=True) == 0
+
+
+def test_the_ground_beside_an_obstacle_stays():
+    with_box = observe(Street(flat, stripes, BOX))
+    without = observe(Street(flat, stripes))
+    beside = [
+        ((o.points_city[:, 0] > 10) & (o.points_city[:, 0] < 20) & (o.points_city[:, 1] > 4)).sum()
+        for o in (with_box, without)
+    ]
+    assert beside[0] > 0.9 * beside[1] > 0
+
+
+def test_a_camera_with_distortion_sees_the_same_street():
+    cam = camera(distortion=(-0.3, 0.09, 0.001, -0.0005, -0.01))
+    assert agreement(observe(Street(flat, stripes), cam=cam)) > 0.97
+
+
+def test_the_range_is_kept():
+    near = observe(Street(flat, stripes), config=AssociationConfig(max_range_m=10.0))
+    assert np.linalg.norm(near.points_city[:, :2], axis=1).max() <= 10.0
+    cells = observe(
+        Street(flat, stripes), method="planar", config=AssociationConfig(lookup_range_m=12.0)
+    )
+    assert np.linalg.norm(cells.points_city[:, :2] - (1.7, 0.1), axis=1).max() <= 12.0
+
+
+@pytest.mark.parametrize("method", ["surface", "planar"])
+def test_each_cell_is_asked_once_at_its_centre(method):
+    pose = SE3.from_yaw(2.4, (-31.07, 12.53, 0.0))
+    seen = observe(Street(flat, stripes), pose=pose, method=method)
+    cells = cells_of(seen.points_city, 0.2)
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    np.testing.assert_allclose((cells + 0.5) * 0.2, seen.points_city[:, :2], atol=1e-9)
+
+
+def test_cell_centres_cover_the_reach():
+    centres = cell_centres_around(camera(), SE3.identity(), 0.5, 5.0)
+    # Area of the circle over the area of a cell.
+    assert len(centres) == pytest.approx(np.pi * 25.0 / 0.25, rel=0.03)
+
+
+def test_moving_objects_and_ignored_pixels_say_nothing_of_the_ground():
+    labels = LabelSet(
+        name="t",
+        labels=(
+            Label(id=0, name="road", color=(0, 0, 0), map_class="road"),
+            Label(id=1, name="car", color=(0, 0, 0), moves=True),
+        ),
+    )
+    speaks = speaks_of_ground(np.array([0, 1, 255, 0], dtype=np.uint8), labels)
+    assert speaks.tolist() == [True, False, False, True]
+
+
+def test_planar_without_a_sweep_takes_the_ego_frames_ground():
+    assert ground_plane(None) == (0.0, 0.0, 0.0)
+
+
+def test_no_ground_points_give_no_observations():
+    street = Street(lambda x, y: np.full(np.broadcast(x, y).shape, -40.0), stripes)
+    seen = observe(street)
+    assert len(seen) == 0
+    assert len(observe(street, method="surface")) == 0

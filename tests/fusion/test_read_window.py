@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from hdmap_tools.association.observations import Observations
+from hdmap_tools.config import ObservationConfig
+from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.observation_model import observation_model
+from hdmap_tools.fusion.read_window import box_mean, read_window
+from hdmap_tools.geometry.grid import BevGrid
+from hdmap_tools.labels.label_set import MAP_CLASSES
+
+from .builders import meta
+
+GRID = BevGrid(0.2, 0, 0, 6, 4)
+
+
+def model(of_meta):
+    return observation_model(ObservationConfig(model="vanilla"), of_meta, MAP_CLASSES, None)
+
+
+def seen(cells, labels, z=0.5, intensity=50):
+    """One point in the middle of each cell (ix, iy)."""
+    xy = (np.array(cells) + 0.5) * 0.2
+    return Observations(
+        np.column_stack([xy, np.full(len(xy), z)]),
+        np.array(labels, np.uint8),
+        np.full(len(xy), intensity, np.uint8),
+    )
+
+
+def test_layers_of_a_known_cell():
+    counts = CellCounts(meta())
+    counts.add(seen([(4, 1)], [1], z=0.5, intensity=50), 0)
+    counts.add(seen([(4, 1)], [1], z=0.7, intensity=60), 1)
+    window = read_window(counts, GRID, model(counts.meta))
+    assert window.grid.shape == (4, 6)
+    assert np.argwhere(window.is_known).tolist() == [[1, 4]]
+    assert window.layer("observations")[1, 4] == 2.0
+    assert window.layer("height")[1, 4] == pytest.approx(0.6)
+    assert window.layer("intensity")[1, 4] == pytest.approx(55.0)
+    posterior = window.dataset["posterior"].values[:, 1, 4]
+    assert posterior.sum() == pytest.approx(1.0, abs=1e-6)
+    expected = -(posterior[posterior > 0] * np.log(posterior[posterior > 0])).sum()
+    assert window.layer("entropy")[1, 4] == pytest.approx(expected, abs=1e-6)
+    assert float(window.dataset["x"][4]) == pytest.approx(0.9)
+    assert float(window.dataset["y"][1]) == pytest.approx(0.3)
+
+
+def test_unknown_stays_unknown_without_filling():
+    counts = CellCounts(meta())
+    counts.add(seen([(0, 0)], [1]), 0)
+    window = read_window(counts, GRID, model(counts.meta), fill_radius_cells=0)
+    assert window.is_known.sum() == 1
+    assert np.isnan(window.layer("entropy")[2, 2])
+    assert np.isnan(window.layer("height")[2, 2])
+
+
+def test_filling_reaches_the_radius_and_claims_no_observations():
+    counts = CellCounts(meta())
+    counts.add(seen([(3, 2)], [1]), 0)
+    window = read_window(counts, GRID, model(counts.meta), fill_radius_cells=1)
+    assert sorted(map(tuple, np.argwhere(window.is_known))) == [
+        (r, c) for r in (1, 2, 3) for c in (2, 3, 4)
+    ]
+    assert window.layer("observations").sum() == 1.0
+    assert window.dataset["posterior"].values[0, 1, 2] == pytest.approx(
+        window.dataset["posterior"].values[0, 2, 3]
+    )
+
+
+def test_filling_leaves_observed_cells_alone():
+    counts = CellCounts(meta())
+    counts.add(seen([(1, 1), (2, 1)], [1, 3]), 0)
+    plain = read_window(counts, GRID, model(counts.meta), 0).dataset["posterior"].values
+    filled = read_window(counts, GRID, model(counts.meta), 1).dataset["posterior"].values
+    np.testing.assert_array_equal(plain[:, 1, 1:3], filled[:, 1, 1:3])
+
+
+def test_filling_sees_beyond_the_window():
+    counts = CellCounts(meta())
+    counts.add(seen([(6, 1)], [1]), 0)
+    window = read_window(counts, GRID, model(counts.meta), fill_radius_cells=1)
+    assert window.is_known[:, 5].tolist() == [True, True, True, False]
+
+
+def test_box_mean_is_the_mean_over_observed_cells_of_the_box():
+    counts = np.zeros((1, 1, 5, 5))
+    counts[0, 0, 1, 1], counts[0, 0, 1, 2] = 6.0, 2.0
+    mean = box_mean(counts, 1)[0, 0]
+    assert mean[0, 0] == pytest.approx(6.0)
+    assert mean[2, 2] == pytest.approx(4.0)
+    assert mean[4, 4] == 0.0
+
+
+def test_a_window_is_read_only():
+    counts = CellCounts(meta())
+    counts.add(seen([(0, 0)], [1]), 0)
+    window = read_window(counts, GRID, model(counts.meta))
+    with pytest.raises(ValueError, match="read-only"):
+        window.dataset["posterior"].values[0, 0, 0] = 1.0

@@ -1,0 +1,147 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from hdmap_tools.errors import MapMismatchError, OutputExistsError, StoreError
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.geometry.grid import BevGrid
+
+from .builders import counts_of, frames_of, meta
+
+
+@pytest.fixture
+def stored(tmp_path):
+    semantic_map = SemanticMap.create(tmp_path / "map", meta())
+    semantic_map.add(counts_of(frames_of(1, 3)), "drive-1")
+    return semantic_map
+
+
+def test_what_is_stored_comes_back_exactly(stored):
+    opened = SemanticMap.open(stored.path)
+    assert opened.meta == meta()
+    assert opened.read().equals(counts_of(frames_of(1, 3)))
+    assert opened.tiles() == tuple(sorted(counts_of(frames_of(1, 3)).tiles))
+    assert opened.drives == {"drive-1": {"num_frames": 3}}
+
+
+def test_commits_add_up_to_the_map_built_in_one_go(stored):
+    stored.add(counts_of(frames_of(2, 2)), "drive-1")
+    stored.add(counts_of(frames_of(3, 2)), "drive-2")
+    whole = counts_of(frames_of(1, 3) + frames_of(2, 2) + frames_of(3, 2))
+    assert stored.read().equals(whole)
+    assert stored.drives == {"drive-1": {"num_frames": 5}, "drive-2": {"num_frames": 2}}
+
+
+def test_a_window_equals_the_window_of_the_counts(stored):
+    grid = BevGrid(0.2, -300, -280, 270, 300)
+    in_memory = counts_of(frames_of(1, 3)).window(grid)
+    assert stored.window(grid).equals(in_memory)
+    assert not in_memory.is_empty
+
+
+def test_merge_and_subtract_on_disk(stored, tmp_path):
+    other = SemanticMap.create(tmp_path / "other", meta())
+    other.add(counts_of(frames_of(7, 2)), "drive-7")
+    before = stored.read()
+    stored.merge(other)
+    assert stored.read().equals(before.merge(other.read()))
+    stored.subtract(other)
+    assert stored.read().equals(before)
+    assert stored.drives == {"drive-1": {"num_frames": 3}}
+
+
+def test_old_versions_stay_readable(stored):
+    first = stored.history()[0]
+    stored.add(counts_of(frames_of(2, 1)), "drive-2")
+    assert [v.message for v in stored.history()][:3] == ["Add drive-2", "Add drive-1", "Empty map"]
+    old = SemanticMap.open(stored.path, first.id)
+    assert old.read().equals(counts_of(frames_of(1, 3)))
+    with pytest.raises(StoreError, match="old version"):
+        old.add(counts_of(frames_of(3, 1)), "drive-3")
+
+
+def test_adding_the_same_drive_twice_by_merging_is_refused(stored, tmp_path):
+    other = SemanticMap.create(tmp_path / "other", meta())
+    other.add(counts_of(frames_of(9, 1)), "drive-1")
+    with pytest.raises(MapMismatchError, match="drive-1; adding it twice"):
+        stored.merge(other)
+
+
+def test_subtracting_a_drive_that_is_not_there_is_refused(stored, tmp_path):
+    other = SemanticMap.create(tmp_path / "other", meta())
+    other.add(counts_of(frames_of(9, 1)), "drive-9")
+    with pytest.raises(MapMismatchError, match=r"does not hold drive-9.*it holds drive-1"):
+        stored.subtract(other)
+
+
+@pytest.mark.parametrize("changes", [{"resolution_m": 0.1}, {"count_mode": "point"}])
+def test_maps_of_another_kind_are_refused_and_change_nothing(stored, tmp_path, changes):
+    other = SemanticMap.create(tmp_path / "other", meta(**changes))
+    other.add(counts_of(frames_of(9, 1), meta(**changes)), "drive-9")
+    versions = len(stored.history())
+    with pytest.raises(MapMismatchError, match="cannot be added"):
+        stored.merge(other)
+    assert len(stored.history()) == versions
+    assert stored.read().equals(counts_of(frames_of(1, 3)))
+
+
+def test_a_refused_subtraction_changes_nothing(stored, tmp_path):
+    other = SemanticMap.create(tmp_path / "other", meta())
+    other.add(counts_of(frames_of(9, 1)), "drive-1")
+    with pytest.raises(MapMismatchError, match="below zero"):
+        stored.subtract(other)
+    assert stored.read().equals(counts_of(frames_of(1, 3)))
+
+
+def test_an_existing_map_is_not_overwritten_unasked(stored):
+    with pytest.raises(OutputExistsError, match="--overwrite"):
+        SemanticMap.create(stored.path, meta())
+    assert SemanticMap.open(stored.path).drives
+
+
+def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "one.jpg").write_bytes(b"x")
+    with pytest.raises(OutputExistsError, match="not a semantic map"):
+        SemanticMap.create(tmp_path / "photos", meta(), overwrite=True)
+    assert (tmp_path / "photos" / "one.jpg").exists()
+
+
+def test_opening_nothing_says_so(tmp_path):
+    with pytest.raises(StoreError, match="No semantic map at"):
+        SemanticMap.open(tmp_path / "none")
+
+
+def test_a_damaged_map_says_so(stored):
+    for file in (stored.path / "snapshots").iterdir():
+        file.write_bytes(b"not a snapshot")
+    with pytest.raises(StoreError, match="Cannot open the map"):
+        SemanticMap.open(stored.path)
+
+
+def test_a_newer_schema_is_refused(tmp_path):
+    import zarr
+
+    semantic_map = SemanticMap.create(tmp_path / "map", meta())
+    session = semantic_map._repository.writable_session("main")
+    group = zarr.open_group(session.store)
+    group.attrs["meta"] = json.loads(json.dumps(group.attrs["meta"])) | {"schema_version": 99}
+    session.commit("from the future")
+    with pytest.raises(StoreError, match="schema version 99"):
+        SemanticMap.open(semantic_map.path)
+
+
+def test_an_empty_map_has_no_grid(tmp_path):
+    semantic_map = SemanticMap.create(tmp_path / "map", meta())
+    assert semantic_map.tiles() == ()
+    assert semantic_map.grid is None
+    assert np.array_equal(
+        semantic_map.window(BevGrid(0.2, 0, 0, 3, 3)).layers["height_n"], np.zeros((3, 3))
+    )
+
+
+def test_a_map_that_was_moved_still_opens(stored, tmp_path):
+    shutil.move(stored.path, tmp_path / "moved")
+    assert SemanticMap.open(tmp_path / "moved").read().equals(counts_of(frames_of(1, 3)))
