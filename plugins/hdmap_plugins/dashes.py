@@ -164,18 +164,19 @@ def _rows(strokes: list[Stroke], rules: JoinRules) -> list[list[Stroke]]:
     place = {k: strokes[k[0]].xy_cells[0 if k[1] == 0 else -1] for k in ends}
     leave = {k: _outward(strokes[k[0]], k[1]) for k in ends}
     reach = max(rules.max_gap, rules.bridge_gap) * 3.0
-    choice: dict[tuple[int, int], tuple[float, tuple[int, int]]] = {}
+    choice: dict[tuple[int, int], tuple[int, int]] = {}
+    all_places = np.array([place[k] for k in ends]).reshape(-1, 2)
+    all_leave = np.array([leave[k] for k in ends]).reshape(-1, 2)
+    owner = np.array([k[0] for k in ends])
     for p in ends:
-        options = []
-        for q in ends:
-            if p[0] == q[0]:
-                continue
-            cost = _cost(place[p], leave[p], place[q], leave[q], reach, rules.max_angle_deg)
-            if cost is not None:
-                options.append((cost, q))
-        if options:
-            choice[p] = min(options)
-    partner = {p: q for p, (_, q) in choice.items() if q in choice and choice[q][1] == p}
+        cost = _costs(
+            place[p], leave[p], all_places, all_leave, reach, np.radians(rules.max_angle_deg)
+        )
+        cost[owner == p[0]] = np.inf
+        best = int(np.argmin(cost))
+        if np.isfinite(cost[best]):
+            choice[p] = ends[best]
+    partner = {p: q for p, q in choice.items() if choice.get(q) == p}
 
     rows: list[list[Stroke]] = []
     used: set[int] = set()
@@ -194,36 +195,37 @@ def _rows(strokes: list[Stroke], rules: JoinRules) -> list[list[Stroke]]:
     return rows
 
 
-def _cost(
+def _costs(
     from_xy: NDArrayFloat,
     heading: NDArrayFloat,
     to_xy: NDArrayFloat,
     other_heading: NDArrayFloat,
     reach: float,
-    max_angle_deg: float,
-) -> float | None:
-    """Distance, made longer by every bend; None when the ends do not continue one another."""
-    chord = to_xy - from_xy
-    distance = float(np.hypot(*chord))
-    if distance > reach:
-        return None
-    if distance < 1e-9:
-        return 0.0
+    max_angle: float,
+) -> NDArrayFloat:
+    """Distance (N,) to each end, longer by every bend; inf where the ends do not continue one another."""
+    result = np.full(len(to_xy), np.inf)
+    distance = np.hypot(*(to_xy - from_xy).T)
+    near = np.flatnonzero(distance <= reach)
+    distance = distance[near]
+    chord = to_xy[near] - from_xy
     # Over a gap of a few cells the angle of the way across is noise.
-    slack = float(np.arctan2(1.5, distance))
-    limit = np.radians(max_angle_deg) + slack
-    turn_out = _turn(heading, chord)
-    turn_in = _turn(chord, -other_heading)
-    if abs(turn_out) > limit or abs(turn_in) > limit:
-        return None
+    slack = np.arctan2(1.5, distance)
+    turn_out = _turns(heading[None], chord)
+    turn_in = _turns(chord, -other_heading[near])
     # On an arc both turns are equal; opposite ones are a jump to a parallel line.
-    if abs(turn_out - turn_in) > 0.6 * np.radians(max_angle_deg) + 2.0 * slack:
-        return None
-    return distance * (1.0 + abs(turn_out) + abs(turn_in))
+    fits = (np.maximum(np.abs(turn_out), np.abs(turn_in)) <= max_angle + slack) & (
+        np.abs(turn_out - turn_in) <= 0.6 * max_angle + 2.0 * slack
+    )
+    cost = distance * (1.0 + np.abs(turn_out) + np.abs(turn_in))
+    result[near] = np.where(distance < 1e-9, 0.0, np.where(fits, cost, np.inf))
+    return result
 
 
-def _turn(a: NDArrayFloat, b: NDArrayFloat) -> float:
-    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
+def _turns(a: NDArrayFloat, b: NDArrayFloat) -> NDArrayFloat:
+    return np.asarray(
+        np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+    )
 
 
 def stations_of(line: Line) -> tuple[NDArrayFloat, NDArrayBool]:

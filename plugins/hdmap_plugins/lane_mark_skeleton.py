@@ -49,7 +49,8 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
         max_width_m: Wider paint is an area (arrow, symbol, hatching), no line.
         max_symbol_m: Paint that is no longer than this and wider across than
             ``max_width_m`` (and a cell's blur on each side) is a symbol.
-        min_length_m: Shorter single strokes are dropped.
+        min_stroke_m: Shorter pieces of paint are specks, not even dashes.
+        min_length_m: Marks with less paint in them are dropped.
         spur_factor: Side branches shorter than this many mask widths are cut off.
         max_deflection_deg: Largest bend with which a line runs on through a junction.
         fill_gap_m: Unknown stripes (between lidar rings) up to this wide are filled.
@@ -71,6 +72,7 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
     contrast: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
     max_width_m: Annotated[float, Field(gt=0.0, le=2.0)] = 0.45
     max_symbol_m: Annotated[float, Field(ge=0.0)] = 8.0
+    min_stroke_m: Annotated[float, Field(ge=0.0)] = 0.4
     min_length_m: Annotated[float, Field(ge=0.0)] = 1.0
     spur_factor: Annotated[float, Field(ge=0.0, le=20.0)] = 2.0
     max_deflection_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 35.0
@@ -125,8 +127,12 @@ class LaneMarkSkeleton(Vectorizer):
                 reach=reach,
                 wavelength=options.smooth_wavelength_m / resolution,
             )
+            if not 0.0 < stroke.width_cells * resolution <= options.max_width_m:
+                continue
+            if float(np.median(stroke.peak)) < options.low_threshold:
+                continue
             stroke = extend_to_ends(paint, stroke, reach=reach)
-            if 0.0 < stroke.width_cells * resolution <= options.max_width_m:
+            if stroke.length * resolution >= options.min_stroke_m:
                 strokes.append(stroke)
         strokes = meet_at_junctions(strokes)
         rules = JoinRules(

@@ -11,7 +11,7 @@ from shapely.geometry import LineString, Point
 from hdmap_plugins.lines import smooth
 from hdmap_plugins.sampling import bilinear
 from hdmap_tools.geometry.polyline import arc_lengths, normals, resample
-from hdmap_tools.types import NDArrayFloat
+from hdmap_tools.types import NDArrayFloat, NDArrayInt
 
 _ACROSS_STEP = 0.25
 """Spacing of samples across a line, cells: bilinear interpolation has nothing finer to show."""
@@ -98,31 +98,31 @@ def measure_across(
     top = np.argmax(centred, axis=1)
     rows = np.arange(len(profile))
     peak = profile[rows, top]
-    in_lobe = np.zeros_like(profile, dtype=bool)
-    in_lobe[rows, top] = True
-    for direction in (-1, 1):
-        lowest = peak.copy()
-        lowest_at = top.copy()
-        is_open = np.ones(len(profile), dtype=bool)
-        for distance in range(1, 2 * half + 1):
-            k = top + direction * distance
-            inside = (k >= 0) & (k < profile.shape[1])
-            value = np.where(inside, profile[rows, np.clip(k, 0, profile.shape[1] - 1)], np.inf)
-            # Up again by an eighth of the peak: the flank of a neighbour.
-            is_open &= inside & (value <= lowest + 0.125 * peak)
-            if not is_open.any():
-                break
-            falls = is_open & (value < lowest)
-            lowest = np.where(falls, value, lowest)
-            lowest_at = np.where(falls, k, lowest_at)
-            is_open &= value > 0.1 * peak
-        left, right = np.minimum(top, lowest_at), np.maximum(top, lowest_at)
-        columns = np.arange(profile.shape[1])
-        in_lobe |= (columns >= left[:, None]) & (columns <= right[:, None])
+    reaches = [_lobe_reach(profile, top, peak, direction) for direction in (-1, 1)]
+    columns = np.arange(profile.shape[1])
+    in_lobe = (columns >= (top - reaches[0])[:, None]) & (columns <= (top + reaches[1])[:, None])
     lobe = np.where(in_lobe, profile, 0.0)
     mass = lobe.sum(axis=1) * _ACROSS_STEP
     offset = (lobe @ across) * _ACROSS_STEP / np.maximum(mass, 1e-9)
     return np.where(mass > 1e-9, offset, 0.0), mass, np.clip(peak, 0.0, 1.0)
+
+
+def _lobe_reach(
+    profile: NDArrayFloat, top: NDArrayInt, peak: NDArrayFloat, direction: int
+) -> NDArrayInt:
+    """How many samples (N,) a lobe reaches from its top to one side."""
+    outward = np.arange(profile.shape[1])
+    at = top[:, None] + direction * outward
+    is_inside = (at >= 0) & (at < profile.shape[1])
+    values = np.take_along_axis(profile, np.where(is_inside, at, 0), axis=1)
+    values = np.where(is_inside, values, np.inf)
+    lowest = np.minimum.accumulate(values, axis=1)
+    # Up again by an eighth of the peak: the flank of a neighbour.
+    is_past = values > lowest + 0.125 * peak[:, None]
+    is_past[:, 1:] |= lowest[:, :-1] <= 0.1 * peak[:, None]
+    is_past = np.logical_or.accumulate(is_past, axis=1) | ~is_inside
+    is_past[:, 0] = False
+    return np.asarray(np.argmin(np.where(is_past, np.inf, values), axis=1))
 
 
 def refine(

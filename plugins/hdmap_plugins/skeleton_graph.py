@@ -136,11 +136,14 @@ def _cut_spurs(graph: nx.MultiGraph[Any], half_width: NDArrayFloat, factor: floa
                         spurs.append((length, end, root, key))
         if not spurs:
             return
-        _, end, root, key = min(spurs)
-        graph.remove_edge(end, root, key)
-        graph.remove_node(end)
-        if graph.degree(root) == 2:
-            _heal(graph, root)
+        for _, end, root, key in sorted(spurs):
+            # An earlier cut may have made a through line of this one.
+            if not graph.has_edge(end, root, key) or graph.degree(root) < 3:
+                continue
+            graph.remove_edge(end, root, key)
+            graph.remove_node(end)
+            if graph.degree(root) == 2:
+                _heal(graph, root)
 
 
 def _width_at(graph: nx.MultiGraph[Any], node: Any, half_width: NDArrayFloat) -> float:
@@ -156,42 +159,49 @@ def _merge_near_junctions(
     The skeleton of two crossing lines is two forks with a bridge between them.
     """
     while True:
-        bridges = [
-            (float(arc_lengths(data["path"])[-1]), a, b)
-            for a, b, data in graph.edges(data=True)
-            if a != b and graph.degree(a) >= 3 and graph.degree(b) >= 3
-        ]
-        bridges = [
-            (length, a, b)
-            for length, a, b in bridges
-            if length
-            < factor * max(_width_at(graph, a, half_width), _width_at(graph, b, half_width))
-        ]
+        bridges = []
+        for a, b, data in graph.edges(data=True):
+            if a != b and graph.degree(a) >= 3 and graph.degree(b) >= 3:
+                length = float(arc_lengths(data["path"])[-1])
+                widths = _width_at(graph, a, half_width), _width_at(graph, b, half_width)
+                if length < factor * max(widths):
+                    bridges.append((length, min(a, b), max(a, b)))
         if not bridges:
             return
-        _, a, b = min(bridges)
-        a, b = min(a, b), max(a, b)
-        if _is_rung(graph, a, b):
-            while graph.has_edge(a, b):
-                graph.remove_edge(a, b)
-            for node in (a, b):
-                if graph.degree(node) == 2:
-                    _heal(graph, node)
-            continue
-        xy = np.mean([graph.nodes[a]["xy"], graph.nodes[b]["xy"]], axis=0)
-        graph.nodes[a]["xy"] = (float(xy[0]), float(xy[1]))
-        while graph.has_edge(a, b):
-            graph.remove_edge(a, b)
-        for _, other, data in list(graph.edges(b, data=True)):
-            path = _oriented(data, b).copy()
-            if other == b:
-                path[-1] = xy
-                other = a
-            path[0] = xy
-            graph.add_edge(a, other, path=path, start=a)
-        graph.remove_node(b)
-        for _, _, data in graph.edges(a, data=True):
-            data["path"][0 if data["start"] == a else -1] = xy
+        touched: set[Any] = set()
+        for _, a, b in sorted(bridges):
+            # Nodes that changed are looked at again in the next round.
+            if a in touched or b in touched:
+                continue
+            touched |= {a, b} | set(graph[a]) | set(graph[b])
+            if _is_rung(graph, a, b):
+                while graph.has_edge(a, b):
+                    graph.remove_edge(a, b)
+                for node in (a, b):
+                    if graph.degree(node) == 2:
+                        _heal(graph, node)
+            else:
+                _contract(graph, a, b)
+
+
+def _contract(graph: nx.MultiGraph[Any], a: Any, b: Any) -> None:
+    """Move node b, with all its branches, into node a; the new place is half way."""
+    xy = np.mean([graph.nodes[a]["xy"], graph.nodes[b]["xy"]], axis=0)
+    graph.nodes[a]["xy"] = (float(xy[0]), float(xy[1]))
+    while graph.has_edge(a, b):
+        graph.remove_edge(a, b)
+    for _, other, data in list(graph.edges(b, data=True)):
+        path = _oriented(data, b).copy()
+        if other == b:
+            path[-1] = xy
+        graph.add_edge(a, a if other == b else other, path=path, start=a)
+    graph.remove_node(b)
+    for _, other, data in graph.edges(a, data=True):
+        path = data["path"]
+        if other == a:
+            path[[0, -1]] = xy
+        else:
+            path[0 if data["start"] == a else -1] = xy
 
 
 def _is_rung(graph: nx.MultiGraph[Any], a: Any, b: Any) -> bool:

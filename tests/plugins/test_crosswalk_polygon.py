@@ -96,14 +96,15 @@ def test_other_shapes_keep_their_outline_the_right_way_round():
     truth = Polygon(
         [(2.05, 2.05), (12.05, 2.05), (12.05, 5.05), (5.05, 5.05), (5.05, 10.05), (2.05, 10.05)]
     )
-    (found,) = crosswalks(scene((0, 0, 16, 12), 0.1, {"crosswalk": truth}))
+    # Closing gaps would round the inner corner.
+    (found,) = crosswalks(scene((0, 0, 16, 12), 0.1, {"crosswalk": truth}), gap_m=0.0)
     assert len(found.geometry.exterior.coords) > 5
     assert iou(found, truth) >= 0.97
     centre, true = found.geometry.centroid, truth.centroid
     assert abs(centre.x - true.x) <= 0.02
     assert abs(centre.y - true.y) <= 0.02
     assert (
-        shapely.hausdorff_distance(shapely.force_2d(found.geometry).exterior, truth.exterior) <= 0.2
+        shapely.hausdorff_distance(shapely.force_2d(found.geometry).exterior, truth.exterior) <= 0.1
     )
 
 
