@@ -14,7 +14,7 @@ unexport PYTHONPATH
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help venv test test-slow test-all lint format bench schemas clean
+.PHONY: help venv test test-slow test-all lint lint-format lint-rules lint-types format bench schemas clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -52,9 +52,16 @@ test-slow: $(READY) ## Run the slow tests only
 test-all: $(READY) ## Run all tests, the slow ones too
 	$(PYTEST) -m 'not benchmark_suite' $(ARGS)
 
-lint: $(READY) ## Check format, lint and types
-	$(BIN)/ruff format --check .
+lint: lint-format lint-rules lint-types ## Check format, lint and types
+
+# Apart, so that `make -k lint` shows the problems of all three.
+lint-format: $(READY)
+	$(BIN)/ruff format --check --quiet .
+
+lint-rules: $(READY)
 	$(BIN)/ruff check .
+
+lint-types: $(READY)
 	$(BIN)/mypy
 
 format: $(READY) ## Format the code and repair what ruff can
