@@ -71,7 +71,23 @@ def contours(probability: NDArrayFloat, level: float, *, close_at_edge: bool) ->
     return sorted(result, key=lambda c: (c.xy_cells[0, 1], c.xy_cells[0, 0], len(c.xy_cells)))
 
 
-def edge_sigma_cells(probability: NDArrayFloat, xy_cells: NDArrayFloat) -> float:
+def edge_slope(probability: NDArrayFloat) -> NDArrayFloat:
+    """(y, x) how much a probability without NaN changes per cell at each cell, 0..1."""
+    field = np.asarray(probability, dtype=np.float64)
+    if min(field.shape) < 2:
+        return np.ones_like(field)
+    slope_y, slope_x = (np.asarray(g) for g in np.gradient(field))
+    # Central differences halve the slope of an edge that is one cell wide, so the
+    # steps between neighbours count too, by half: an edge drawn by coverage is two wide.
+    steps = np.hypot(
+        np.diff(field, axis=0, append=field[-1:]), np.diff(field, axis=1, append=field[:, -1:])
+    )
+    neighbours: NDArrayFloat = ndimage.maximum_filter(steps, size=2)
+    slope = np.maximum(np.hypot(slope_x, slope_y), 0.5 * neighbours)
+    return np.asarray(np.minimum(slope, 1.0))
+
+
+def edge_sigma_cells(slope: NDArrayFloat, xy_cells: NDArrayFloat) -> float:
     """How well an outline's place is known, from how steeply the probability falls across it.
 
     A sharp edge blurred by a Gaussian of sigma (poses, calibration, label noise)
@@ -81,25 +97,11 @@ def edge_sigma_cells(probability: NDArrayFloat, xy_cells: NDArrayFloat) -> float
     is never below 0.40 cells: the resolution's own share is within the figure.
 
     Args:
-        probability: (y, x), no NaN.
+        slope: (y, x) of `edge_slope`.
         xy_cells: (N, 2) places on the outline.
 
     Returns:
         One standard deviation, cells; at most 5.
     """
-    if min(probability.shape) < 2:
-        return 0.5
-    slope_y, slope_x = (np.asarray(g) for g in np.gradient(np.asarray(probability)))
-    central = np.hypot(bilinear(slope_x, xy_cells), bilinear(slope_y, xy_cells))
-    # Central differences halve the slope of a one-cell step; ends of the range win.
-    forward: NDArrayFloat = ndimage.maximum_filter(
-        np.hypot(
-            np.diff(probability, axis=0, append=probability[-1:]),
-            np.diff(probability, axis=1, append=probability[:, -1:]),
-        ),
-        size=2,
-    )
-    steep = np.minimum(np.maximum(central, 0.0), 1.0)
-    one_cell = np.minimum(bilinear(forward, xy_cells), 1.0)
-    slope = float(np.median(np.maximum(steep, 0.5 * one_cell)))
-    return float(min(1.0 / (np.sqrt(2.0 * np.pi) * max(slope, 1e-3)), 5.0))
+    typical = float(np.median(bilinear(slope, xy_cells)))
+    return float(np.clip(1.0 / (np.sqrt(2.0 * np.pi) * max(typical, 1e-3)), 0.0, 5.0))

@@ -11,7 +11,7 @@ from pydantic import Field
 from scipy import ndimage
 from shapely.geometry import Polygon
 
-from hdmap_plugins.contours import contours, edge_sigma_cells
+from hdmap_plugins.contours import contours, edge_sigma_cells, edge_slope
 from hdmap_plugins.lines import kept_by_simplification
 from hdmap_plugins.rectangles import fit_rectangle
 from hdmap_plugins.sampling import disk, fill_small_gaps, plane_heights, to_city
@@ -78,6 +78,7 @@ class CrosswalkPolygon(Vectorizer):
         probability = _close_gaps(probability, options.gap_m / resolution)
         height, votes = window.layer("height"), window.layer("observations")
 
+        slope = edge_slope(probability)
         result: list[MapElement] = []
         for contour in contours(probability, options.threshold, close_at_edge=True):
             # Positive rings run around holes.
@@ -111,7 +112,7 @@ class CrosswalkPolygon(Vectorizer):
                 Crosswalk(
                     geometry=geometry,
                     confidence=float(np.clip(evidence.mean(), 0.0, 1.0)),
-                    sigma_m=edge_sigma_cells(probability, contour.xy_cells) * resolution,
+                    sigma_m=edge_sigma_cells(slope, contour.xy_cells) * resolution,
                     num_observations=round(float(np.median(seen))) if seen.size else 0,
                 )
             )

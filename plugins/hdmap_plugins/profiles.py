@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Point
 
 from hdmap_plugins.lines import smooth
@@ -233,24 +234,29 @@ def meet_at_junctions(strokes: list[Stroke]) -> list[Stroke]:
     goes straight on to the other.
     """
     result = list(strokes)
+    if len(strokes) < 2:
+        return result
+    owner = np.concatenate([np.full(len(s.xy_cells), k) for k, s in enumerate(strokes)])
+    tree = cKDTree(np.vstack([s.xy_cells for s in strokes]))
     for index in range(len(result)):
         for _ in range(2):
             result[index] = result[index].reversed()
-            if result[index].at_junction[1]:
-                result[index] = _meet_at_last(result[index], result, index)
+            stroke = result[index]
+            if not stroke.at_junction[1]:
+                continue
+            end = stroke.xy_cells[-1]
+            near = np.sort(tree.query_ball_point(end, stroke.width_cells + 3.0)).astype(np.int64)
+            near = near[owner[near] != index]
+            if len(near):
+                closest = near[np.argmin(np.hypot(*(tree.data[near] - end).T))]
+                result[index] = _meet_at_last(stroke, result[owner[closest]])
     return result
 
 
-def _meet_at_last(stroke: Stroke, strokes: list[Stroke], index: int) -> Stroke:
+def _meet_at_last(stroke: Stroke, other: Stroke) -> Stroke:
     end = stroke.xy_cells[-1]
-    best, other = np.inf, None
-    for k, candidate in enumerate(strokes):
-        if k != index and len(candidate.xy_cells) >= 2:
-            distance = float(np.hypot(*(candidate.xy_cells - end).T).min())
-            if distance < best:
-                best, other = distance, candidate
     limit = stroke.width_cells + 3.0
-    if other is None or best > limit or len(stroke.xy_cells) < 6:
+    if len(stroke.xy_cells) < 6:
         return stroke
     line = LineString(other.xy_cells)
     # Cells blur each by one: nearer than this the two are not told apart.

@@ -9,7 +9,7 @@ from pydantic import Field
 from scipy import ndimage
 from shapely.geometry import LineString
 
-from hdmap_plugins.contours import Contour, contours, edge_sigma_cells
+from hdmap_plugins.contours import Contour, contours, edge_sigma_cells, edge_slope
 from hdmap_plugins.lines import kept_by_simplification, smooth
 from hdmap_plugins.sampling import (
     bilinear,
@@ -99,6 +99,7 @@ class RoadBoundaryOutline(Vectorizer):
         surface = height_surface(window.layer("height"))
         has_height = np.isfinite(window.layer("height"))
 
+        slope = edge_slope(drivable)
         result: list[MapElement] = []
         for contour in contours(field, options.threshold, close_at_edge=False):
             length_m = float(arc_lengths(contour.xy_cells)[-1]) * resolution
@@ -126,7 +127,7 @@ class RoadBoundaryOutline(Vectorizer):
                     kind=_kind(surface, has_height, xy, to_road, options, resolution),
                     is_island=contour.is_closed and contour.signed_area_cells > 0.0,
                     confidence=float(np.clip(np.mean(support), 0.0, 1.0)),
-                    sigma_m=edge_sigma_cells(drivable, contour.xy_cells) * resolution,
+                    sigma_m=edge_sigma_cells(slope, contour.xy_cells) * resolution,
                     num_observations=votes_at(
                         window.layer("observations"), np.vstack([road_side, far_side])
                     ),
