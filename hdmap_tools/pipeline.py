@@ -7,8 +7,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import Reference, load_reference
@@ -44,10 +47,11 @@ from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_
 from hdmap_tools.segmentation.confusion import ConfusionMatrix, find_confusion
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
+from hdmap_tools.types import NDArrayByte
 from hdmap_tools.vectorization import PluginFailure, VectorizationResult, vectorize
 from hdmap_tools.view.agreement import agreement_picture
 from hdmap_tools.view.image_overlay import project_window_into_image
-from hdmap_tools.view.overview import CameraPicture, Panel, overview_picture
+from hdmap_tools.view.overview import CameraPicture, Panel, known_bounds, overview_picture
 
 if TYPE_CHECKING:
     from hdmap_tools.map_model.vector_map import VectorMap
@@ -60,6 +64,8 @@ EXPORT_NAMES: Final = {"lanelet2": "lanelet2_map.osm", "geojson": "map.geojson"}
 OVERVIEW_NAME: Final = "overview.png"
 AGREEMENT_NAME: Final = "agreement.png"
 METRICS_NAME: Final = "metrics.json"
+
+_PHOTO_WIDTH_PX: Final = 1000
 
 IMAGES_PER_SEGMENT: Final = 240
 """Images fused between two commits: bounds memory and what a killed build loses."""
@@ -228,16 +234,22 @@ def build_map(
         if number:
             _LOG.warning("%d of %d images left out: %s.", number, len(drive.images), reason)
 
+    looked_at: dict[ImageRef, NDArrayByte] = {}
+
     def labels_of(some: tuple[ImageRef, ...]) -> LabelledImages:
-        return segment_drive(drive, segmenter, some, cache)
+        for image, labels in segment_drive(drive, segmenter, some, cache):
+            looked_at[image] = labels
+            yield image, labels
 
     with steps.timed("segment and fuse"):
         threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
         meta = map_meta(config, drive, segmenter.label_set, segmenter.name, threshold)
         semantic_map = SemanticMap.create(path, meta, overwrite=overwrite)
         others: dict[str, CellCounts] = {}
-        labelled = segment_drive(drive, segmenter, images, cache, steps.segmented)
-        for segment in in_segments(labelled, IMAGES_PER_SEGMENT):
+        # Labels made for the threshold are not made again; the order of frames does not matter.
+        rest = [image for image in images if image not in looked_at]
+        labelled = segment_drive(drive, segmenter, rest, cache, steps.segmented)
+        for segment in in_segments(chain(looked_at.items(), labelled), IMAGES_PER_SEGMENT):
             fused = fuse(source, segment, meta, source.methods, counts)
             semantic_map.add(fused.pop(config.association.method), drive.id)
             for name, more in fused.items():
@@ -297,6 +309,7 @@ def compare_alone(
     drive_path: Path | None = None,
     scene: str | None = None,
     picture: Path | None = None,
+    overwrite: bool = False,
 ) -> RasterComparison:
     """Hold a semantic map against a reference; near the driven path if the drive is given."""
     semantic_map = SemanticMap.open(map_path)
@@ -315,7 +328,9 @@ def compare_alone(
         count_filled=config.compare.count_filled,
     )
     if picture is not None:
-        agreement_picture(window, reference, comparison, picture, trajectory_xy=path_xy)
+        agreement_picture(
+            window, reference, comparison, picture, trajectory_xy=path_xy, overwrite=overwrite
+        )
     return comparison
 
 
@@ -389,8 +404,9 @@ def draw(
     image = middle_front_image(drive)
     camera = drive.cameras[image.camera]
     pose = drive.trajectory.interpolate(image.timestamp_ns, config.drive.max_pose_gap_s)
-    photo = read_image(image, camera)
-    overlaid = project_window_into_image(window, vector_map, camera, pose, photo)
+    photo = shrunk(read_image(image, camera), _PHOTO_WIDTH_PX)
+    small_camera = camera.scaled(photo.shape[1], photo.shape[0])
+    overlaid = project_window_into_image(window, vector_map, small_camera, pose, photo)
     panels = [Panel(f"{method}, with vectors", window, vector_map)]
     panels += [Panel(name, other) for name, other in windows.items()]
     overview_picture(
@@ -402,8 +418,20 @@ def draw(
         ],
         trajectory_xy=drive.trajectory.translations,
         city_SE3_ego=pose,
+        bounds_m=known_bounds([window]),
         title=drive.id,
     )
+
+
+def shrunk(image: NDArrayByte, max_width_px: int) -> NDArrayByte:
+    """A picture (height, width, 3) no wider than that; a report needs no more pixels."""
+    import cv2
+
+    height, width = image.shape[:2]
+    if width <= max_width_px:
+        return image
+    size = (max_width_px, max(round(height * max_width_px / width), 1))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def middle_front_image(drive: Drive) -> ImageRef:

@@ -39,8 +39,6 @@ def cell_centres_around(
     return np.asarray(xy[np.linalg.norm(xy - centre, axis=1) <= reach_m])
 
 
-def project_city(
-    points_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3
-) -> Projection:
+def project_city(points_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3) -> Projection:
     """Project city points (N, 3) into a camera at an ego pose."""
     return camera.project(city_SE3_ego.inverse().transform_from(points_city))

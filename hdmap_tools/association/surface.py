@@ -67,9 +67,7 @@ def associate_surface(
     return Observations(points_city[use][speaks], labels[speaks])
 
 
-def _onto_surface(
-    xy_city: NDArrayFloat, city_SE3_ego: SE3, surface: GroundSurface
-) -> NDArrayFloat:
+def _onto_surface(xy_city: NDArrayFloat, city_SE3_ego: SE3, surface: GroundSurface) -> NDArrayFloat:
     """City points (N, 3) on a ground surface given in the ego frame; only where it is known.
 
     The ego frame is nearly upright: the position on the surface is found by two

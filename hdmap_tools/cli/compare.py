@@ -19,6 +19,7 @@ from hdmap_tools.cli import options
 @click.option("--max-range", type=float, help="How near to the driven path, metres [default: 40].")
 @click.option("--confusion", type=options.PATH, help="Confusion matrix to read the map with.")
 @options.drive_options
+@options.overwrite_option
 @options.json_option
 @options.config_options
 def command(**given: Any) -> None:
@@ -48,6 +49,7 @@ def command(**given: Any) -> None:
         drive_path=given["drive"],
         scene=given["scene"],
         picture=given["picture"],
+        overwrite=given["overwrite"],
     )
     options.write_json(given["json_path"], comparison.to_json())
     click.echo(

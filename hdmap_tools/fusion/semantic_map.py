@@ -221,6 +221,7 @@ class SemanticMap:
         Raises:
             MapMismatchError: If the maps are not compatible, or hold a drive in common.
         """
+        self.meta.require_compatible(other.meta)
         common = sorted(self.drives.keys() & other.drives.keys())
         if common:
             raise MapMismatchError(
@@ -235,6 +236,7 @@ class SemanticMap:
         Raises:
             MapMismatchError: If this map does not hold the other's drives and counts.
         """
+        self.meta.require_compatible(other.meta)
         missing = sorted(other.drives.keys() - self.drives.keys())
         if missing:
             raise MapMismatchError(

@@ -4,8 +4,7 @@ import pytest
 from hdmap_tools.association.ground import GroundedSweep, estimate_ground, near_ground
 from hdmap_tools.errors import ShapeError
 from hdmap_tools.geometry.se3 import SE3
-
-from .scenes import Street, flat, slope, stripes
+from hdmap_tools.testing.street import Street, flat, slope, stripes
 
 BOX = (12.0, -1.0, 16.0, 1.0, 1.8)
 

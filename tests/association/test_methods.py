@@ -10,8 +10,7 @@ from hdmap_tools.config import AssociationConfig
 from hdmap_tools.geometry.grid import cells_of
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import Label, LabelSet, load_label_set
-
-from .scenes import Street, camera, distance_to_edge, flat, slope, stripes
+from hdmap_tools.testing.street import Street, camera, distance_to_edge, flat, slope, stripes
 
 ADAS = load_label_set("adas-0001")
 CONFIG = AssociationConfig()

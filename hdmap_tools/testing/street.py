@@ -10,12 +10,20 @@ import numpy as np
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.readers.drive import Sweep
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayByte, NDArrayFloat
+
+Field = Callable[[NDArrayFloat, NDArrayFloat], NDArrayAny]
+"""A value at city positions x, y (arrays of one shape), metres."""
 
 # Camera axes (x right, y down, z ahead) in a frame with x ahead, y left, z up.
 LOOKING_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def camera(height_m: float = 1.5, distortion=(0.0, 0.0, 0.0, 0.0, 0.0)) -> PinholeCamera:
+def camera(
+    height_m: float = 1.5,
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0),
+) -> PinholeCamera:
+    """A front camera of 640 x 400 pixels, 1.7 m ahead of the ego origin."""
     mount = SE3(LOOKING_AHEAD, np.array([1.7, 0.1, height_m]))
     return PinholeCamera("FRONT", 640, 400, 470.0, 476.0, 314.3, 187.7, mount, distortion)
 
@@ -30,11 +38,13 @@ class Street:
         box: (x0, y0, x1, y1, top) of a box that stands on the ground, label 0.
     """
 
-    height: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    label: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    height: Field
+    label: Field
     box: tuple[float, float, float, float, float] | None = None
 
-    def cast(self, origin: np.ndarray, rays: np.ndarray, max_t: float = 120.0):
+    def cast(
+        self, origin: NDArrayFloat, rays: NDArrayFloat, max_t: float = 120.0
+    ) -> tuple[NDArrayFloat, NDArrayBool]:
         """Nearest hit along rays (N, 3): parameter t, and whether it is the box; inf without one."""
         t = np.zeros(len(rays))
         # The ground is a gentle height field (slopes below 0.2): march, then settle.
@@ -59,7 +69,8 @@ class Street:
             t = np.minimum(t, box_t)
         return t, is_box
 
-    def label_image(self, cam: PinholeCamera, city_SE3_ego: SE3) -> np.ndarray:
+    def label_image(self, cam: PinholeCamera, city_SE3_ego: SE3) -> NDArrayByte:
+        """The true label (height, width) of each pixel; 0 for the box and the sky."""
         v, u = np.mgrid[0 : cam.height_px, 0 : cam.width_px]
         rays = cam.rays_ego(np.column_stack([u.ravel(), v.ravel()])) @ city_SE3_ego.rotation.T
         eye = city_SE3_ego.transform_from(cam.ego_SE3_cam.translation[None])[0]
@@ -69,36 +80,40 @@ class Street:
         return labels.reshape(cam.height_px, cam.width_px).astype(np.uint8)
 
     def sweep(self, city_SE3_ego: SE3, rings: int = 32, lidar_height_m: float = 1.9) -> Sweep:
+        """A noise-free sweep of a still vehicle; paint (label 3) has intensity 90, the rest 20."""
         elevation = np.deg2rad(np.linspace(-30.0, 10.0, rings))
         azimuth = np.deg2rad(np.arange(0.0, 360.0, 0.33))
         e, a = (g.ravel() for g in np.meshgrid(elevation, azimuth, indexing="ij"))
         rays_ego = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         eye_ego = np.array([0.9, 0.0, lidar_height_m])
         rays = rays_ego @ city_SE3_ego.rotation.T
-        t, _ = self.cast(city_SE3_ego.transform_from(eye_ego[None])[0], rays)
+        t, is_box = self.cast(city_SE3_ego.transform_from(eye_ego[None])[0], rays)
         hit = np.isfinite(t)
         points = eye_ego + t[hit, None] * rays_ego[hit]
         ring = np.repeat(np.arange(rings), len(azimuth))[hit]
-        intensity = np.full(hit.sum(), 20, dtype=np.uint8)
+        points_city = city_SE3_ego.transform_from(points)
+        is_paint = (self.label(points_city[:, 0], points_city[:, 1]) == 3) & ~is_box[hit]
+        intensity = np.where(is_paint, 90, 20).astype(np.uint8)
         return Sweep(0, points, intensity, ring.astype(np.uint8))
 
 
-def flat(x, y):
+def flat(x: NDArrayFloat, y: NDArrayFloat) -> NDArrayFloat:
+    """Level ground at height 0."""
     return np.zeros(np.broadcast(x, y).shape)
 
 
-def slope(x, y):
+def slope(x: NDArrayFloat, y: NDArrayFloat) -> NDArrayFloat:
     """Climbs 4 % ahead after 5 m, with a 2 % crown."""
-    return 0.04 * np.maximum(x - 5.0, 0.0) - 0.02 * np.abs(y)
+    return np.asarray(0.04 * np.maximum(x - 5.0, 0.0) - 0.02 * np.abs(y))
 
 
-def stripes(x, y):
+def stripes(x: NDArrayFloat, y: NDArrayFloat) -> NDArrayAny:
     """Road (1) with marks (3) 0.5 m wide along the road every 3 m, background (0) beyond 6 m."""
     labels = np.where(np.abs(np.mod(y + 0.25, 3.0)) < 0.5, 3, 1)
     return np.where(np.abs(y) > 6.0, 0, labels)
 
 
-def distance_to_edge(y):
+def distance_to_edge(y: NDArrayFloat) -> NDArrayFloat:
     """How far a position is from the nearest edge of a label of `stripes`, metres."""
     edges = np.concatenate([np.arange(-6, 7, 3) - 0.25, np.arange(-6, 7, 3) + 0.25, [-6.0, 6.0]])
-    return np.abs(np.asarray(y)[:, None] - edges).min(axis=1)
+    return np.asarray(np.abs(np.asarray(y)[:, None] - edges).min(axis=1))
