@@ -111,8 +111,10 @@ class LaneMarkSkeleton(Vectorizer):
         raw = window.probability(MapClass.LANE_MARK).astype(np.float64)
         if min(raw.shape) == 0 or not (raw >= options.low_threshold).any():
             return []
-        paint, is_known = fill_small_gaps(raw, window.is_known, options.fill_gap_m / resolution)
-        mask = _line_mask(paint, options, resolution)
+        filled, is_known = fill_small_gaps(raw, window.is_known, options.fill_gap_m / resolution)
+        paint = _above_background(filled, is_known, options.max_width_m / resolution)
+        wide = _wide_areas(filled, options.max_width_m / resolution)
+        mask = _line_mask(paint, wide, options, resolution)
         reach = options.max_width_m / 2.0 / resolution + 2.0
         strokes = []
         for line in skeleton_lines(
@@ -152,8 +154,24 @@ class LaneMarkSkeleton(Vectorizer):
         return [mark for mark in marks if mark is not None]
 
 
+def _above_background(
+    probability: NDArrayFloat, is_known: NDArrayBool, max_width_cells: float
+) -> NDArrayFloat:
+    """(y, x) in 0..1: how far the probability of paint stands out of the ground around it.
+
+    A network that often misses paint leaves every road cell with some probability of
+    it (0.2 and more), which is no line however far it goes. The ground's level is the
+    probability opened by a square that no line can hold, over known cells only.
+    """
+    size = 2 * int(np.ceil(max_width_cells / 2.0 + 1.0)) + 1
+    eroded = ndimage.minimum_filter(np.where(is_known, probability, np.inf), size=size)
+    ground = ndimage.maximum_filter(np.where(is_known, eroded, -np.inf), size=size)
+    ground = np.where(is_known, np.minimum(ground, probability), 0.0)
+    return np.asarray((probability - ground) / np.maximum(1.0 - ground, 1e-6))
+
+
 def _line_mask(
-    paint: NDArrayFloat, options: LaneMarkSkeletonOptions, resolution: float
+    paint: NDArrayFloat, wide: NDArrayBool, options: LaneMarkSkeletonOptions, resolution: float
 ) -> NDArrayBool:
     """(y, x) bool: cells of thin paint, wide areas and symbols taken out."""
     from skimage.filters import apply_hysteresis_threshold
@@ -165,7 +183,8 @@ def _line_mask(
     )
     if not mask.any():
         return mask
-    wide = _wide_areas(paint, options.max_width_m / resolution) & mask
+    # Opening takes the inside of an area; what is left of it is a rim.
+    mask |= wide
     labels, count = ndimage.label(mask, structure=np.ones((3, 3)))
     is_dropped = np.zeros(count + 1, dtype=bool)
     for label, area in enumerate(ndimage.find_objects(labels), start=1):

@@ -50,8 +50,9 @@ class RoadBoundaryOptions(VectorizerOptions):
         min_length_m: Shorter open lines are dropped.
         fill_gap_m: Unknown stripes (between lidar rings) up to this wide are filled;
             wider ones end the boundary, for nothing is known of it there.
-        tolerance_m: The line stays this near to the outline: 0.7 of it for smoothing,
-            the rest for leaving out vertices.
+        tolerance_m: The line stays this near to the outline: 0.7 of it for smoothing
+            (or half a cell, if that is more: stairs of cells are no shape of the
+            road), the rest for leaving out vertices.
         smooth_wavelength_m: Wiggles shorter than this are smoothed, within the tolerance.
         kerb_min_m: Least step up from the road that makes a kerb.
         kerb_high_m: Least step of a high kerb, which a car does not drive over.
@@ -103,6 +104,12 @@ class RoadBoundaryOutline(Vectorizer):
         result: list[MapElement] = []
         for contour in contours(field, options.threshold, close_at_edge=False):
             length_m = float(arc_lengths(contour.xy_cells)[-1]) * resolution
+            area_m2 = contour.signed_area_cells * resolution**2 if contour.is_closed else 0.0
+            least = options.min_island_area_m2 if area_m2 > 0.0 else options.min_road_area_m2
+            # A ring can be small though what it parts from the rest is not: where
+            # areas touch at corners only.
+            if contour.is_closed and abs(area_m2) < least:
+                continue
             if not contour.is_closed and length_m < max(options.min_length_m, resolution):
                 continue
             xy = _smoothed(contour, options, resolution)
@@ -125,7 +132,7 @@ class RoadBoundaryOutline(Vectorizer):
                 RoadBoundary(
                     geometry=geometry,
                     kind=_kind(surface, has_height, xy, to_road, options, resolution),
-                    is_island=contour.is_closed and contour.signed_area_cells > 0.0,
+                    is_island=area_m2 > 0.0,
                     confidence=float(np.clip(np.mean(support), 0.0, 1.0)),
                     sigma_m=edge_sigma_cells(slope, contour.xy_cells) * resolution,
                     num_observations=votes_at(
@@ -174,7 +181,7 @@ def _smoothed(contour: Contour, options: RoadBoundaryOptions, resolution: float)
         xy,
         options.smooth_wavelength_m / resolution / _STATION_CELLS,
         is_closed=contour.is_closed,
-        max_move=_SMOOTHING_SHARE * options.tolerance_m / resolution,
+        max_move=max(_SMOOTHING_SHARE * options.tolerance_m / resolution, 0.5),
     )
 
 
