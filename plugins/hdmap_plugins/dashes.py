@@ -11,6 +11,9 @@ from hdmap_plugins.profiles import Stroke
 from hdmap_plugins.sampling import nearest
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
 
+_MAX_WIDTH_RATIO = 2.5
+"""Strokes whose widths differ more are not one line; over a few cells a width is good to a factor."""
+
 
 @dataclass(frozen=True)
 class JoinRules:
@@ -87,7 +90,8 @@ def _fused(row: list[Stroke], is_known: NDArrayBool, max_gap: float) -> list[Str
     for stroke in row[1:]:
         last = result[-1]
         gap = _gap(last, stroke, is_known)
-        if not gap.is_known or gap.length > max_gap:
+        narrow, wide = sorted((last.width_cells, stroke.width_cells))
+        if not gap.is_known or gap.length > max_gap or wide > _MAX_WIDTH_RATIO * narrow:
             result.append(stroke)
             continue
         between = _between(last, stroke)

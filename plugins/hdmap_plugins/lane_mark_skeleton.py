@@ -21,6 +21,7 @@ from hdmap_plugins.sampling import (
     to_city,
     votes_at,
 )
+from hdmap_plugins.short_strokes import take_short_strokes
 from hdmap_plugins.skeleton_graph import skeleton_lines
 from hdmap_tools.geometry.polyline import drop_repeats
 from hdmap_tools.plugin_api import (
@@ -116,7 +117,13 @@ class LaneMarkSkeleton(Vectorizer):
         wide = _wide_areas(filled, options.max_width_m / resolution)
         mask = _line_mask(paint, wide, options, resolution)
         reach = options.max_width_m / 2.0 / resolution + 2.0
-        strokes = []
+        short, mask = take_short_strokes(paint, mask, reach=reach)
+        strokes = [
+            s
+            for s in short
+            if _is_narrow_paint(s, options, resolution)
+            and s.length * resolution >= options.min_stroke_m
+        ]
         for line in skeleton_lines(
             mask,
             spur_factor=options.spur_factor,
@@ -129,13 +136,10 @@ class LaneMarkSkeleton(Vectorizer):
                 reach=reach,
                 wavelength=options.smooth_wavelength_m / resolution,
             )
-            if not 0.0 < stroke.width_cells * resolution <= options.max_width_m:
-                continue
-            if float(np.median(stroke.peak)) < options.low_threshold:
-                continue
-            stroke = extend_to_ends(paint, stroke, reach=reach)
-            if stroke.length * resolution >= options.min_stroke_m:
-                strokes.append(stroke)
+            if _is_narrow_paint(stroke, options, resolution):
+                stroke = extend_to_ends(paint, stroke, reach=reach)
+                if stroke.length * resolution >= options.min_stroke_m:
+                    strokes.append(stroke)
         strokes = meet_at_junctions(strokes)
         rules = JoinRules(
             max_gap=options.max_gap_m / resolution,
@@ -152,6 +156,12 @@ class LaneMarkSkeleton(Vectorizer):
             for line in join_strokes(strokes, is_known, rules)
         )
         return [mark for mark in marks if mark is not None]
+
+
+def _is_narrow_paint(stroke: Stroke, options: LaneMarkSkeletonOptions, resolution: float) -> bool:
+    """Whether a stroke is no wider than a line and mostly above the threshold."""
+    is_narrow = 0.0 < stroke.width_cells * resolution <= options.max_width_m
+    return is_narrow and float(np.median(stroke.peak)) >= options.low_threshold
 
 
 def _above_background(
@@ -198,9 +208,12 @@ def _line_mask(
             and short_side > options.max_width_m / resolution + 2.0
         )
     mask &= ~is_dropped[labels] & ~wide
-    return np.asarray(
-        mask & (blurred >= options.contrast * ndimage.maximum_filter(blurred, size=5))
-    )
+    mask &= blurred >= options.contrast * ndimage.maximum_filter(blurred, size=5)
+    # What the cuts left over must be sure of itself somewhere.
+    labels, count = ndimage.label(mask, structure=np.ones((3, 3)))
+    is_sure = np.zeros(count + 1, dtype=bool)
+    is_sure[np.unique(labels[mask & (blurred >= options.high_threshold)])] = True
+    return np.asarray(mask & is_sure[labels])
 
 
 def _wide_areas(paint: NDArrayFloat, max_width_cells: float) -> NDArrayBool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Point
 
@@ -180,8 +181,12 @@ def extend_to_ends(probability: NDArrayFloat, stroke: Stroke, *, reach: float) -
 
 def _extend_last(probability: NDArrayFloat, stroke: Stroke, reach: float) -> Stroke:
     width = stroke.width_cells
-    cut = min(int(np.ceil(width)) + 1, (len(stroke.xy_cells) - 1) // 3)
-    keep = len(stroke.xy_cells) - cut
+    half = 0.5 * float(np.median(stroke.mass))
+    # A mask may lead on along something faint; five stations outvote a worn cell or two.
+    steady = ndimage.median_filter(stroke.mass, size=min(5, len(stroke.mass)), mode="nearest")
+    count = int(np.flatnonzero(steady >= half)[-1]) + 1 if (steady >= half).any() else 0
+    cut = min(int(np.ceil(width)) + 1, max(count - 1, 0) // 3)
+    keep = count - cut
     body = stroke.xy_cells[:keep]
     if len(body) < 2:
         return stroke
@@ -206,7 +211,6 @@ def _extend_last(probability: NDArrayFloat, stroke: Stroke, reach: float) -> Str
     offset, mass, peak = measure_across(probability, places, normal, reach)
     # Paint beside the way ahead is another line's.
     mass = np.where(np.abs(offset) <= 1.0, mass, 0.0)
-    half = 0.5 * float(np.median(stroke.mass[: max(keep, 1)]))
     below = np.flatnonzero(mass < half)
     if len(below) == 0:
         end = float(cut)

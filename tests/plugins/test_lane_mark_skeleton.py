@@ -133,7 +133,7 @@ def dash_row(start: float, count: int, dash: float, gap: float, slope: float) ->
 
 
 @pytest.mark.parametrize("resolution_m", RESOLUTIONS)
-@pytest.mark.parametrize(("dash", "gap"), [(3, 6), (1, 1), (6, 12)])
+@pytest.mark.parametrize(("dash", "gap"), [(3, 6), (1, 1), (6, 12), (0.75, 1.5)])
 def test_dashes_make_one_dashed_mark(resolution_m, dash, gap):
     dashes = dash_row(1.03, 4, dash, gap, 0.1)
     truth = LineString([dashes[0].coords[0], dashes[-1].coords[-1]])
@@ -321,3 +321,28 @@ def test_any_straight_line(angle_deg, offset_m, width_m, resolution_m):
     hidden = max(resolution_m - width_m, 0.0) / 2 + resolution_m / 8
     assert rms_to(mark, truth) <= hidden + 0.1 * resolution_m
     assert end_error(mark, truth) <= resolution_m
+
+
+def test_a_doubtful_network_makes_no_lines_of_bare_road():
+    """Road cells hold 0.2 of lane mark when a network often misses paint."""
+    line = LineString([(2, 3.1), (18, 4.3)])
+    window = scene(painted(line), (0, 0, 20, 8), 0.2)
+    posterior = window.dataset["posterior"].values.copy()
+    _, y = np.meshgrid(window.grid.x_centres_m, window.grid.y_centres_m)
+    strip = (np.abs(y - 6) < 0.4) | (np.abs(y - 3) < 2)
+    posterior[2] = np.where(strip, 0.2 + 0.8 * posterior[2], 0.01)
+    posterior[0] = 1.0 - posterior[[1, 2, 3, 4]].sum(axis=0)
+    (mark,) = marks(window_from_posterior(posterior, window.grid))
+    assert rms_to(mark, line) <= 0.05
+    assert end_error(mark, line) <= 0.2
+    assert mark.width_m == pytest.approx(0.15, rel=0.2)
+
+
+def test_a_line_ends_where_the_paint_grows_faint():
+    window = scene(painted(LineString([(2, 3.1), (18, 3.1)])), (0, 0, 20, 6), 0.1)
+    posterior = window.dataset["posterior"].values.copy()
+    faint = window.grid.x_centres_m > 12
+    posterior[2][:, faint] *= 0.3
+    posterior[0] = 1.0 - posterior[[1, 2, 3, 4]].sum(axis=0)
+    (mark,) = marks(window_from_posterior(posterior, window.grid))
+    assert end_error(mark, LineString([(2, 3.1), (12, 3.1)])) <= 0.1
