@@ -85,7 +85,7 @@ class FusionConfig(_Step):
     """How frames become counts.
 
     Attributes:
-        resolution_m: Cell size.
+        resolution_m: Cell size. Paint is 0.10 to 0.15 m wide; the paper used 0.2 m.
         count_mode: How a frame votes in a cell: ``majority`` (one vote for the
             most frequent label), ``share`` (16 quanta shared among the labels
             seen), ``frame`` (one vote for each label seen), ``point`` (one vote
@@ -95,7 +95,7 @@ class FusionConfig(_Step):
         reference_height_m: City height that stored heights count from.
     """
 
-    resolution_m: Annotated[float, Field(gt=0)] = 0.2
+    resolution_m: Annotated[float, Field(gt=0)] = 0.1
     count_mode: Literal["majority", "share", "frame", "point"] = "share"
     intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
     reference_height_m: float = 0.0

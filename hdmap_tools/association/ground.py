@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -36,12 +37,16 @@ class GroundSurface:
 
     samples: NDArrayFloat
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.samples[:, :2])
+
     def height_at(self, xy: NDArrayFloat) -> NDArrayFloat:
         """Height (N,) at positions (N, 2), metres; NaN further than 4 m from ground seen."""
         if len(self.samples) == 0 or len(xy) == 0:
             return np.full(len(xy), np.nan)
         neighbours = min(6, len(self.samples))
-        distance, index = cKDTree(self.samples[:, :2]).query(xy[:, :2], k=neighbours)
+        distance, index = self._tree.query(xy[:, :2], k=neighbours)
         distance, index = distance.reshape(len(xy), -1), index.reshape(len(xy), -1)
         weight = 1.0 / (distance + 0.1) ** 2
         height = (weight * self.samples[index, 2]).sum(axis=1) / weight.sum(axis=1)

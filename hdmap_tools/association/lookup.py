@@ -27,16 +27,40 @@ def speaks_of_ground(labels: NDArrayByte, label_set: LabelSet) -> NDArrayBool:
 def cell_centres_around(
     camera: PinholeCamera, city_SE3_ego: SE3, resolution_m: float, reach_m: float
 ) -> NDArrayFloat:
-    """City positions (N, 2) of the lattice's cell centres within reach of a camera.
+    """City positions (N, 2) of the lattice's cell centres that a camera may see.
 
     Centres of the map's own cells, so that a frame asks each cell exactly once.
+    Those within reach and, seen from above, within the camera's view and a margin;
+    which of them the image really holds, the projection says.
     """
     centre = city_SE3_ego.transform_from(camera.ego_SE3_cam.translation[None])[0, :2]
     middle = np.floor(centre / resolution_m)
     reach = np.arange(-(reach_m // resolution_m) - 1, reach_m // resolution_m + 2)
     steps = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     xy = (middle + steps + 0.5) * resolution_m
-    return np.asarray(xy[np.linalg.norm(xy - centre, axis=1) <= reach_m])
+    near = np.linalg.norm(xy - centre, axis=1) <= reach_m
+    return np.asarray(xy[near & _may_be_in_view(xy - centre, camera, city_SE3_ego)])
+
+
+def _may_be_in_view(
+    offset_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3
+) -> NDArrayBool:
+    """Which horizontal directions (N, 2) from a camera may meet its image; errs towards yes."""
+    u = np.linspace(0, camera.width_px - 1, 9)
+    v = np.linspace(0, camera.height_px - 1, 9)
+    border = np.concatenate(
+        [np.column_stack([u, np.full(9, e)]) for e in (v[0], v[-1])]
+        + [np.column_stack([np.full(9, e), v]) for e in (u[0], u[-1])]
+    )
+    rays = camera.rays_ego(border) @ city_SE3_ego.rotation.T
+    axis = (city_SE3_ego.rotation @ camera.ego_SE3_cam.rotation)[:2, 2]
+    flat = np.linalg.norm(rays[:, :2], axis=1)
+    if not np.isfinite(rays).all() or np.linalg.norm(axis) < 0.5 or (flat < 0.2).any():
+        return np.ones(len(offset_city), dtype=bool)  # looks up or down: any direction may be seen
+    axis = axis / np.linalg.norm(axis)
+    widest = float((rays[:, :2] @ axis / flat).min()) - 0.05
+    forward = offset_city @ axis
+    return np.asarray(forward >= widest * np.linalg.norm(offset_city, axis=1))
 
 
 def project_city(points_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3) -> Projection:

@@ -22,12 +22,12 @@ from hdmap_tools.cli import options
 @options.config_options
 @click.pass_context
 def command(ctx: click.Context, /, **given: Any) -> None:
-    r"""Fuse a drive into a semantic map.
+    """Fuse a drive into a semantic map.
 
     \b
     Examples:
       hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
-      hdmap build path/to/drive -o map --association sparse --resolution 0.1
+      hdmap build path/to/drive -o map --association sparse --resolution 0.2
 
     The map is a versioned repository of counts; read it with `hdmap vectorize`,
     `hdmap compare` and `hdmap info`, add maps with `hdmap merge`.

@@ -23,7 +23,7 @@ from hdmap_tools.cli import options
 @options.json_option
 @options.config_options
 def command(**given: Any) -> None:
-    r"""Hold a semantic map against a reference, where the map has evidence.
+    """Hold a semantic map against a reference, where the map has evidence.
 
     \b
     Examples:

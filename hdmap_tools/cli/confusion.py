@@ -26,12 +26,12 @@ from hdmap_tools.cli import options
 @click.option("--source", default="", help="Where images and masks come from; kept in the file.")
 @options.overwrite_option
 def command(**given: Any) -> None:
-    r"""Measure a network's confusion matrix on annotated images.
+    """Measure a network's confusion matrix on annotated images.
 
     \b
     Examples:
       hdmap confusion images masks -o confusion.json --model m.xml --mask-labels cityscapes
-      hdmap confusion waymo waymo -o c.json --model m.xml --mask-labels waymo-panoptic \
+      hdmap confusion waymo waymo -o c.json --model m.xml --mask-labels waymo-panoptic \\
           --mask-suffix _panoptic --mask-divisor 1000
     """
     from hdmap_tools.formats.atomic import atomic_output

@@ -23,7 +23,7 @@ from hdmap_tools.cli import options
 @options.overwrite_option
 @options.json_option
 def command(**given: Any) -> None:
-    r"""Write a vector map in another format.
+    """Write a vector map in another format.
 
     \b
     Examples:

@@ -16,7 +16,7 @@ from hdmap_tools.cli import options
 @click.option("--default-config", is_flag=True, help="Print hdmap.yaml with all defaults instead.")
 @options.json_option
 def command(path: Path | None, **given: Any) -> None:
-    r"""Say what a drive, a semantic map or a vector file holds.
+    """Say what a drive, a semantic map or a vector file holds.
 
     \b
     Examples:

@@ -16,14 +16,14 @@ import click
 from hdmap_tools import __version__
 
 _COMMANDS: Final = {
-    "run": "Turn a drive into a map: all steps.",
+    "run": "Turn a drive into a map.",
     "segment": "Write label images of a drive's images.",
     "build": "Fuse a drive into a semantic map.",
     "vectorize": "Run vectorizer plugins over a semantic map.",
     "export": "Write a vector map in another format.",
-    "compare": "Hold a semantic map against a reference.",
-    "confusion": "Measure a network's confusion matrix.",
-    "merge": "Add semantic maps, or take one out of another.",
+    "compare": "Hold a semantic map against a reference, where the map has evidence.",
+    "confusion": "Measure a network's confusion matrix on annotated images.",
+    "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
     "info": "Say what a drive, a map or a vector file holds.",
     "plugins": "List, describe and check vectorizer plugins.",
 }
@@ -61,7 +61,7 @@ class _LazyGroup(click.Group):
 @click.option("-q", "--quiet", is_flag=True, help="Only errors.")
 @click.pass_context
 def hdmap(ctx: click.Context, verbose: int, quiet: bool) -> None:
-    r"""From a drive to an HD map.
+    """From a drive to an HD map.
 
     \b
     Examples:

@@ -16,7 +16,7 @@ from hdmap_tools.cli import options
 @click.option("--subtract", type=options.PATH, multiple=True, help="Take this map out; repeatable.")
 @options.overwrite_option
 def command(maps: tuple[Path, ...], out: Path, subtract: tuple[Path, ...], **given: Any) -> None:
-    r"""Add semantic maps: the sum equals the map built from all drives at once.
+    """Add semantic maps: the sum equals the map built from all drives at once.
 
     \b
     Examples:

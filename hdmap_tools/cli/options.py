@@ -82,7 +82,7 @@ def association_option(function: F) -> F:
 
 def resolution_option(function: F) -> F:
     """--resolution."""
-    return click.option("--resolution", type=float, help="Cell size, metres [default: 0.2].")(
+    return click.option("--resolution", type=float, help="Cell size, metres [default: 0.1].")(
         function
     )
 

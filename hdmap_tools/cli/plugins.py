@@ -11,7 +11,7 @@ from hdmap_tools.cli import options
 
 @click.group("plugins")
 def command() -> None:
-    r"""List, describe and check vectorizer plugins.
+    """List, describe and check vectorizer plugins.
 
     \b
     Examples:
@@ -23,7 +23,7 @@ def command() -> None:
 @command.command("list")
 @options.json_option
 def list_plugins(json_path: Path | None) -> None:
-    r"""List installed vectorizers: name, version, distribution, status.
+    """List installed vectorizers: name, version, distribution, status.
 
     \b
     Examples:
@@ -59,7 +59,7 @@ def list_plugins(json_path: Path | None) -> None:
 @command.command("info")
 @click.argument("name")
 def info(name: str) -> None:
-    r"""Describe a vectorizer: what it emits, what it requires, its options.
+    """Describe a vectorizer: what it emits, what it requires, its options.
 
     \b
     Examples:
@@ -89,7 +89,7 @@ def info(name: str) -> None:
 @click.argument("name")
 @options.json_option
 def check(name: str, json_path: Path | None) -> int:
-    r"""Run the conformance checks on an installed vectorizer.
+    """Run the conformance checks on an installed vectorizer.
 
     \b
     Examples:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @options.config_options
 @click.pass_context
 def command(ctx: click.Context, /, **given: Any) -> int:
-    r"""Turn a drive into a map.
+    """Turn a drive into a map.
 
     \b
     Examples:

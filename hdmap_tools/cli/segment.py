@@ -19,7 +19,7 @@ from hdmap_tools.cli import options
 @options.config_options
 @click.pass_context
 def command(ctx: click.Context, /, **given: Any) -> None:
-    r"""Write label images of a drive's images.
+    """Write label images of a drive's images.
 
     \b
     Examples:

@@ -24,7 +24,7 @@ from hdmap_tools.cli import options
 @options.json_option
 @options.config_options
 def command(**given: Any) -> int:
-    r"""Run vectorizer plugins over a semantic map.
+    """Run vectorizer plugins over a semantic map.
 
     \b
     Examples:
