@@ -346,3 +346,21 @@ def test_a_line_ends_where_the_paint_grows_faint():
     posterior[0] = 1.0 - posterior[[1, 2, 3, 4]].sum(axis=0)
     (mark,) = marks(window_from_posterior(posterior, window.grid))
     assert end_error(mark, LineString([(2, 3.1), (12, 3.1)])) <= 0.1
+
+
+def test_a_short_gap_is_bridged_only_where_the_ground_was_seen():
+    line = LineString([(1, 3.4), (31, 3.4)])
+    unseen = box(15, 0, 15.6, 8)
+    worn = marks(scene(painted(line).difference(unseen), (0, 0, 32, 8), 0.1))
+    hidden = marks(scene(painted(line), (0, 0, 32, 8), 0.1, unknown=unseen))
+    assert len(worn) == 1
+    assert len(hidden) == 2
+    # Stripes up to fill_gap_m count as seen: that is what the option is for.
+    assert len(marks(scene(painted(line), (0, 0, 32, 8), 0.1, unknown=unseen), fill_gap_m=0.7)) == 1
+
+
+def test_a_dash_missing_on_seen_ground_ends_the_mark():
+    dashes = dash_row(1.03, 7, 3, 6, 0.0)
+    found = marks(scene(painted(*dashes[:3], *dashes[4:]), (0, 0, 60, 8), 0.2))
+    assert [m.style for m in found] == [MarkStyle.DASHED] * 2
+    assert all(m.geometry.length == pytest.approx(21, abs=0.4) for m in found)
