@@ -26,12 +26,14 @@ class DriveConfig(_Step):
 
     Attributes:
         layout: Reader to use; ``auto`` guesses from the folder.
+        scene: Which drive of a data root that holds several.
         cameras: Camera names; empty means all calibrated ones.
         max_pose_gap_s: Frames in a longer gap between poses are dropped and counted.
         max_sweep_gap_s: Largest time between an image and the sweep used with it.
     """
 
     layout: str = "auto"
+    scene: str | None = None
     cameras: tuple[str, ...] = ()
     max_pose_gap_s: Annotated[float, Field(gt=0)] = 0.5
     max_sweep_gap_s: Annotated[float, Field(gt=0)] = 0.1

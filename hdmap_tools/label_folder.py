@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from hdmap_tools.config import Config
-from hdmap_tools.errors import DriveError
 from hdmap_tools.output_folder import MARKER, output_folder
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
@@ -31,12 +30,7 @@ def write_label_folder(
 
     Returns:
         Number of images, share of pixels by label, milliseconds an image.
-
-    Raises:
-        DriveError: If the drive has no images.
     """
-    if not drive.images:
-        raise DriveError(f"Drive {drive.name} in {drive.root} has no images to segment.")
     pixels = np.zeros(256, dtype=np.int64)
     start = time.perf_counter()
     with output_folder(out, overwrite) as folder:

@@ -46,6 +46,15 @@ class FrameCounts:
     dropped: Counter[str] = field(default_factory=Counter)
 
 
+def require_images(drive: Drive) -> None:
+    """Raise `DriveError` if a drive has nothing to segment."""
+    if not drive.images:
+        raise DriveError(
+            f"Drive {drive.name} has no images, so there is nothing to segment. Expected images of "
+            f"{', '.join(drive.cameras) or 'a calibrated camera'} in {drive.root}."
+        )
+
+
 class FrameSource:
     """Poses and sweeps of a drive's images; keeps the last sweep, which several cameras share."""
 
@@ -71,11 +80,7 @@ class FrameSource:
             PoseError: If a camera has no image with a pose.
         """
         drive, config = self._drive, self._config
-        if not drive.images:
-            raise DriveError(
-                f"Drive {drive.name} has no images, so there is nothing to segment. Expected images of "
-                f"{', '.join(drive.cameras) or 'a calibrated camera'} in {drive.root}."
-            )
+        require_images(drive)
         times = np.array([image.timestamp_ns for image in drive.images], dtype=np.int64)
         has_pose = drive.trajectory.covers(times, config.drive.max_pose_gap_s)
         with_pose = [i for i, ok in zip(drive.images, has_pose, strict=True) if ok]

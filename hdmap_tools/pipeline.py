@@ -36,6 +36,7 @@ from hdmap_tools.mapping import (
     in_segments,
     intensity_threshold,
     map_meta,
+    require_images,
 )
 from hdmap_tools.output_folder import MARKER, map_folder, output_folder
 from hdmap_tools.plugin_api import MapWindow
@@ -109,7 +110,6 @@ def run(
     out: Path,
     config: Config,
     *,
-    scene: str | None = None,
     cache: LabelCache | None = None,
     overwrite: bool = False,
     steps: Steps | None = None,
@@ -121,7 +121,6 @@ def run(
         out: Folder to make: semantic_map, features.gpkg, exports, pictures,
             metrics.json and the configuration used.
         config: Every step's settings.
-        scene: Which drive of a data root.
         cache: Where label images are kept between runs.
         overwrite: Replace an earlier result.
         steps: Told of progress.
@@ -132,7 +131,7 @@ def run(
     steps = steps or Steps()
     with output_folder(out, overwrite) as folder:
         with steps.timed("open"):
-            drive = open_for(config, drive_path, scene)
+            drive = open_for(config, drive_path)
             segmenter = open_segmenter(config.segmentation, drive)
         semantic_map, counts, others = build_map(
             drive, segmenter, folder / MAP_NAME, config, cache, steps
@@ -196,9 +195,16 @@ def run(
     return RunResult(metrics, result.failures)
 
 
-def open_for(config: Config, drive_path: Path, scene: str | None = None) -> Drive:
-    """Open a drive as configured, and settle its place on earth."""
-    drive = open_drive(drive_path, config.drive.layout, scene, config.drive.cameras)
+def open_configured(config: Config, drive_path: Path) -> Drive:
+    """Open a drive as configured."""
+    wanted = config.drive
+    return open_drive(drive_path, wanted.layout, wanted.scene, wanted.cameras)
+
+
+def open_for(config: Config, drive_path: Path) -> Drive:
+    """Open a drive to be mapped: it has images, and its place on earth is settled."""
+    drive = open_configured(config, drive_path)
+    require_images(drive)
     origin = config.export.origin
     if origin is not None and drive.frame.is_georeferenced:
         raise ConfigError(
@@ -262,7 +268,6 @@ def build_alone(
     out: Path,
     config: Config,
     *,
-    scene: str | None = None,
     cache: LabelCache | None = None,
     overwrite: bool = False,
     steps: Steps | None = None,
@@ -275,7 +280,7 @@ def build_alone(
     steps = steps or Steps()
     with map_folder(out, overwrite) as folder:
         with steps.timed("open"):
-            drive = open_for(config, drive_path, scene)
+            drive = open_for(config, drive_path)
             segmenter = open_segmenter(config.segmentation, drive)
         semantic_map, counts, _ = build_map(drive, segmenter, folder, config, cache, steps)
         return {
@@ -307,7 +312,6 @@ def compare_alone(
     config: Config,
     *,
     drive_path: Path | None = None,
-    scene: str | None = None,
     picture: Path | None = None,
     overwrite: bool = False,
 ) -> RasterComparison:
@@ -317,7 +321,7 @@ def compare_alone(
     reference = load_reference(reference_path, window.grid)
     path_xy = None
     if drive_path is not None:
-        drive = open_drive(drive_path, config.drive.layout, scene, config.drive.cameras)
+        drive = open_configured(config, drive_path)
         drive.frame.require_same(semantic_map.meta.frame)
         path_xy = drive.trajectory.translations[:, :2]
     comparison = compare_raster(

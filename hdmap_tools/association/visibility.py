@@ -11,6 +11,8 @@ from hdmap_tools.geometry.camera import PinholeCamera, Projection
 from hdmap_tools.types import NDArrayBool
 
 _CELL_PX: Final = 4
+_NEAREST_M: Final = 2.0
+"""Nearer returns come from the vehicle itself: roof, bonnet, the sensors' own mounts."""
 _MARGIN_M: Final = 0.5
 """A point must lie this much behind an occluder; covers extent and timing of moving things."""
 
@@ -41,7 +43,7 @@ def is_unoccluded(
         (N,) bool; False for points that are not in the image.
     """
     visible = projection.is_valid.copy()
-    blockers = projection.is_valid & is_occluder
+    blockers = projection.is_valid & is_occluder & (projection.depth_m > _NEAREST_M)
     if not blockers.any():
         return visible
     shape = (-(-camera.height_px // _CELL_PX), -(-camera.width_px // _CELL_PX))

@@ -39,6 +39,7 @@ def command(**given: Any) -> None:
         given["settings"],
         cameras=given["cameras"],
         drive__layout=given["layout"],
+        drive__scene=given["scene"],
         compare__max_range_m=given["max_range"],
         observation__confusion=given["confusion"],
     )
@@ -47,7 +48,6 @@ def command(**given: Any) -> None:
         given["reference"],
         config,
         drive_path=given["drive"],
-        scene=given["scene"],
         picture=given["picture"],
         overwrite=given["overwrite"],
     )

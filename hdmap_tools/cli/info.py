@@ -38,7 +38,8 @@ def command(path: Path | None, **given: Any) -> None:
 
 def _show(facts: dict[str, Any], indent: str = "") -> None:
     for name, value in facts.items():
-        label = f"{indent}{name.replace('_', ' ')}"
+        # Below the first level stand names: of cameras, drives, element types.
+        label = indent + name if indent else name.replace("_", " ")
         if isinstance(value, dict):
             click.echo(f"{label}:")
             _show(value, indent + "  ")

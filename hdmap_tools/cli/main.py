@@ -24,7 +24,7 @@ _COMMANDS: Final = {
     "compare": "Hold a semantic map against a reference, where the map has evidence.",
     "confusion": "Measure a network's confusion matrix on annotated images.",
     "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
-    "info": "Say what a drive, a map or a vector file holds.",
+    "info": "Say what a drive, a semantic map or a vector file holds.",
     "plugins": "List, describe and check vectorizer plugins.",
 }
 """Name and summary of each command; the module of a command is imported when it is called."""

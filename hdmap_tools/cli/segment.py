@@ -29,7 +29,8 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     Writes OUT/CAMERA/TIMESTAMP_NS.png (uint8 ids) and OUT/label_set.json.
     """
     from hdmap_tools.label_folder import write_label_folder
-    from hdmap_tools.readers.open_drive import open_drive
+    from hdmap_tools.mapping import require_images
+    from hdmap_tools.pipeline import open_configured
     from hdmap_tools.segmentation.open_segmenter import open_segmenter
 
     config = options.resolve_config(
@@ -37,12 +38,14 @@ def command(ctx: click.Context, /, **given: Any) -> None:
         given["settings"],
         cameras=given["cameras"],
         drive__layout=given["layout"],
+        drive__scene=given["scene"],
         segmentation__model=given["model"],
         segmentation__profile=given["profile"],
         segmentation__labels=given["labels"],
         segmentation__label_set=given["label_set"],
     )
-    drive = open_drive(given["drive"], config.drive.layout, given["scene"], config.drive.cameras)
+    drive = open_configured(config, given["drive"])
+    require_images(drive)
     segmenter = open_segmenter(config.segmentation, drive)
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
         report = write_label_folder(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hdmap_tools.errors import DriveError, ShapeError, SweepError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import Trajectory
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +115,18 @@ class Drive:
         """``<layout>:<name>``."""
         return f"{self.layout}:{self.name}"
 
+    @cached_property
+    def _sweep_times_ns(self) -> NDArrayInt:
+        return np.array([s.timestamp_ns for s in self.sweeps], dtype=np.int64)
+
     def nearest_sweep(self, timestamp_ns: int, max_gap_s: float) -> SweepRef | None:
         """The sweep nearest in time, or None when all are further away than max_gap_s."""
         if not self.sweeps:
             return None
-        times = np.array([s.timestamp_ns for s in self.sweeps], dtype=np.int64)
-        index = int(np.argmin(np.abs(times - timestamp_ns)))
+        times = self._sweep_times_ns
+        after = int(np.searchsorted(times, timestamp_ns))
+        near = range(max(after - 1, 0), min(after + 1, len(times)))
+        index = min(near, key=lambda k: abs(int(times[k]) - timestamp_ns))
         return (
             self.sweeps[index] if abs(int(times[index]) - timestamp_ns) <= max_gap_s * 1e9 else None
         )

@@ -96,7 +96,7 @@ def test_two_runs_give_the_same_bytes(made, hdmap):
 def test_the_configuration_used_is_written_and_can_be_used_again(made, hdmap):
     folder, _ = made
     config = load_config(folder / "hdmap.yaml")
-    assert config.fusion.resolution_m == 0.2
+    assert config.fusion.resolution_m == 0.1
     code, _, err = hdmap("run", "drive", "-o", "third", "--config", folder / "hdmap.yaml")
     assert code == 0, err
     assert (folder / "lanelet2_map.osm").read_bytes() == (
