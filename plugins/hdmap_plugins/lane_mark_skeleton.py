@@ -11,7 +11,7 @@ from scipy import ndimage
 from shapely.geometry import LineString
 
 from hdmap_plugins.dashes import JoinRules, Line, join_strokes, stations_of
-from hdmap_plugins.lines import kept_by_simplification, smooth
+from hdmap_plugins.lines import MIN_STEP_M, kept_by_simplification, smooth
 from hdmap_plugins.profiles import Stroke, extend_to_ends, meet_at_junctions, refine
 from hdmap_plugins.sampling import (
     disk,
@@ -255,7 +255,9 @@ def _lane_mark(
         xy, options.simplify_m / resolution, is_closed=line.strokes[0].is_closed
     )
     z = heights_along(surface, xy, round(2.0 / resolution))
-    geometry = LineString(drop_repeats(np.column_stack([to_city(xy[kept], window.grid), z[kept]])))
+    geometry = LineString(
+        drop_repeats(np.column_stack([to_city(xy[kept], window.grid), z[kept]]), MIN_STEP_M)
+    )
     painted = xy[is_painted]
     votes = votes_at(window.layer("observations"), painted)
     if line.is_dashed:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
 from hdmap_tools.types import NDArrayFloat, NDArrayInt
+
+MIN_STEP_M: Final = 0.05
+"""Vertices nearer than this to the one before are left out; Lanelet2's checks warn about them."""
 
 
 def smooth(

@@ -10,7 +10,7 @@ from scipy import ndimage
 from shapely.geometry import LineString
 
 from hdmap_plugins.contours import Contour, contours, edge_sigma_cells, edge_slope
-from hdmap_plugins.lines import kept_by_simplification, smooth
+from hdmap_plugins.lines import MIN_STEP_M, kept_by_simplification, smooth
 from hdmap_plugins.sampling import (
     bilinear,
     fill_small_gaps,
@@ -124,7 +124,7 @@ class RoadBoundaryOutline(Vectorizer):
             far_side = xy - to_road * max(0.3 / resolution, 1.0)
             z = heights_along(surface, road_side, round(2.0 / resolution / _STATION_CELLS))
             xyz = np.column_stack([to_city(xy[kept], window.grid), z[kept]])
-            geometry = LineString(drop_repeats(xyz))
+            geometry = LineString(drop_repeats(xyz, MIN_STEP_M))
             if len(xyz) < 2 or not geometry.is_valid:
                 continue
             support = bilinear(drivable, xy + to_road) * (1.0 - bilinear(drivable, xy - to_road))

@@ -8,10 +8,11 @@ import shapely
 from shapely import affinity
 from shapely.geometry import Point, Polygon, box
 
+from hdmap_plugins.lane_mark_skeleton import LaneMarkSkeleton
 from hdmap_plugins.road_boundary import RoadBoundaryOptions, RoadBoundaryOutline
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.plugin_api import BoundaryKind, MapWindow, RoadBoundary, VectorMap
-from hdmap_tools.testing.scenes import window_from_posterior, window_from_shapes
+from hdmap_tools.testing.scenes import street_scene, window_from_posterior, window_from_shapes
 
 EVERYWHERE = box(-100, -100, 200, 200)
 RESOLUTIONS = [0.1, 0.2]
@@ -237,3 +238,18 @@ def test_same_input_same_bytes_and_whole_cells_move_exactly():
             atol=1e-9,
         )
         assert (a.confidence, a.sigma_m, a.kind) == (b.confidence, b.sigma_m, b.kind)
+
+
+def test_no_two_vertices_are_nearer_than_lanelet2_likes():
+    window = street_scene(resolution_m=0.1, noise=1.5, rng=np.random.default_rng(3))
+    elements = [
+        element
+        for plugin in (RoadBoundaryOutline(), LaneMarkSkeleton())
+        for element in plugin.vectorize(
+            window, VectorMap(window.frame), plugin.Options(), rng=np.random.default_rng(0)
+        )
+    ]
+    assert len(elements) > 8
+    for element in elements:
+        steps = np.linalg.norm(np.diff(np.array(element.geometry.coords)[:, :2], axis=0), axis=1)
+        assert steps.min() > 0.05
