@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdmap_tools.errors import ShapeError
-from hdmap_tools.types import NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,13 +17,15 @@ class Observations:
     Attributes:
         points_city: (N, 3) float64 metres, city frame: where the ground was seen.
         labels: (N,) uint8 ids of the segmentation's label set.
-        intensity: (N,) uint8 lidar intensity; None when there is no lidar
-            (all votes then count into the lowest intensity bin).
+        intensity: (N,) uint8 lidar intensity; None when there is none at all.
+        has_intensity: (N,) bool: where a return measured it; None means everywhere.
+            A vote without intensity counts into the lowest bin: it is no sign of paint.
     """
 
     points_city: NDArrayFloat
     labels: NDArrayByte
     intensity: NDArrayByte | None = None
+    has_intensity: NDArrayBool | None = None
 
     def __post_init__(self) -> None:
         count = len(self.labels)
@@ -40,6 +42,10 @@ class Observations:
             raise ShapeError(
                 f"Intensity must be (N,) uint8, found {self.intensity.shape} {self.intensity.dtype}."
             )
+        if self.has_intensity is not None and (
+            self.intensity is None or self.has_intensity.shape != (count,)
+        ):
+            raise ShapeError("has_intensity must be (N,) and come with intensity.")
         if not np.isfinite(self.points_city).all():
             raise ShapeError(
                 "Observations hold NaN or infinite points; readers and association drop them first."

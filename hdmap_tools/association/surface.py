@@ -23,9 +23,10 @@ from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.visibility import is_unoccluded
 from hdmap_tools.config import AssociationConfig
 from hdmap_tools.geometry.camera import PinholeCamera, Projection
+from hdmap_tools.geometry.grid import cells_of
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import LabelSet
-from hdmap_tools.types import NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
 
 
 def associate_surface(
@@ -64,7 +65,31 @@ def associate_surface(
         use = is_unoccluded(both, is_occluder, camera)[: len(use)]
     labels = labels_at(label_image, projection.uv[use])
     speaks = speaks_of_ground(labels, label_set)
-    return Observations(points_city[use][speaks], labels[speaks])
+    points_city = points_city[use][speaks]
+    intensity, has_intensity = _intensity_in_cells(points_city, grounded, resolution_m)
+    return Observations(points_city, labels[speaks], intensity, has_intensity)
+
+
+def _intensity_in_cells(
+    points_city: NDArrayFloat, grounded: GroundedSweep, resolution_m: float
+) -> tuple[NDArrayByte, NDArrayBool]:
+    """Mean intensity of the sweep's ground returns in each point's cell, and where there is one."""
+    returns = cells_of(grounded.points_city[grounded.is_ground], resolution_m)
+    values = grounded.sweep.intensity[grounded.is_ground].astype(np.float64)
+    cells, of_return = np.unique(returns, axis=0, return_inverse=True)
+    if len(cells) == 0:
+        return np.zeros(len(points_city), np.uint8), np.zeros(len(points_city), bool)
+    number = np.bincount(of_return.reshape(-1))
+    mean = np.rint(np.bincount(of_return.reshape(-1), weights=values) / number).astype(np.uint8)
+    # Rows of cells as single numbers, in the same order as np.unique sorted them.
+    low, span = cells.min(axis=0), np.ptp(cells, axis=0) + 1
+    asked = cells_of(points_city, resolution_m) - low
+    inside = ((asked >= 0) & (asked < span)).all(axis=1)
+    keys = (cells - low) @ np.array([span[1], 1])
+    key = np.where(inside, asked @ np.array([span[1], 1]), -1)
+    at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+    found = keys[at] == key
+    return np.where(found, mean[at], 0).astype(np.uint8), np.asarray(found)
 
 
 def _onto_surface(xy_city: NDArrayFloat, city_SE3_ego: SE3, surface: GroundSurface) -> NDArrayFloat:

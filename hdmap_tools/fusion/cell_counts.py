@@ -113,10 +113,13 @@ class CellCounts:
                 f"city origin; at {self.meta.resolution_m} m the map reaches "
                 f"{LATTICE_CELLS // 2 * self.meta.resolution_m / 1000:.0f} km. Use a nearer origin."
             )
-        if observations.intensity is None:
-            bins = np.zeros(len(observations), dtype=np.int64)
-        else:
-            bins = (observations.intensity >= self.meta.intensity_threshold).astype(np.int64)
+        intensity, has_intensity = observations.intensity, observations.has_intensity
+        if intensity is None:
+            intensity = np.zeros(len(observations), dtype=np.uint8)
+            has_intensity = np.zeros(len(observations), dtype=bool)
+        elif has_intensity is None:
+            has_intensity = np.ones(len(observations), dtype=bool)
+        bins = (has_intensity & (intensity >= self.meta.intensity_threshold)).astype(np.int64)
         votes = cast_votes(
             cells,
             observations.labels,
@@ -142,8 +145,10 @@ class CellCounts:
             layers = self._tile(index).layers
             flat = y * TILE_CELLS + x
             _add_sums(layers, "height", flat, height_mm[rows], squared=True)
-            if observations.intensity is not None:
-                _add_sums(layers, "intensity", flat, observations.intensity[rows].astype(np.int64))
+            measured = has_intensity[rows]
+            _add_sums(
+                layers, "intensity", flat[measured], intensity[rows][measured].astype(np.int64)
+            )
 
     def merge(self, other: CellCounts) -> CellCounts:
         """The sum of both; equal to adding all frames of both to one.

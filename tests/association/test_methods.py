@@ -178,3 +178,15 @@ def test_no_cell_in_the_image_is_left_out(yaw, distortion):
         assert set(map(tuple, seen)) <= set(map(tuple, centres))
     # About the share of the circle that 70 degrees of view take.
     assert len(centres) < 0.5 * len(every)
+
+
+def test_the_surface_carries_intensity_where_a_return_measured_it():
+    seen = observe(Street(flat, stripes), method="surface")
+    assert seen.has_intensity is not None
+    share = seen.has_intensity.mean()
+    assert 0.005 < share < 0.5  # rings, and nothing between them
+    x, y = seen.points_city[:, 0], seen.points_city[:, 1]
+    clear = seen.has_intensity & (distance_to_edge(y) > 0.15)
+    expected = np.where(stripes(x, y) == 3, 90, 20)
+    assert clear.sum() > 50
+    assert (seen.intensity == expected)[clear].all()

@@ -161,3 +161,16 @@ def test_a_window_outside_all_tiles_is_empty():
     window = counts_of(frames_of(0, 1)).window(BevGrid(0.2, 9000, 9000, 9010, 9020))
     assert window.layers["counts"].shape == (4, 2, 20, 10)
     assert window.is_empty
+
+
+def test_a_point_without_intensity_is_no_sign_of_paint():
+    observations = Observations(
+        np.array([[0.1, 0.1, 0.0], [0.3, 0.1, 0.0]]),
+        np.array([1, 1], np.uint8),
+        np.array([200, 200], np.uint8),
+        np.array([True, False]),
+    )
+    layers = counts_of([(0, observations)]).tiles[(0, 0)].layers
+    assert layers["counts"][1, :, 0, :2].tolist() == [[0, 16], [16, 0]]
+    assert layers["intensity_n"][0, :2].tolist() == [1, 0]
+    assert layers["intensity_sum"][0, :2].tolist() == [200, 0]
