@@ -7,10 +7,10 @@ import pytest
 
 from hdmap_tools.association.ground import GroundedSweep
 from hdmap_tools.association.sparse import associate_sparse
-from hdmap_tools.cli.main import main
 from hdmap_tools.compare.mask_file import load_mask
 from hdmap_tools.config import Config
 from hdmap_tools.formats.gpkg import read_gpkg
+from hdmap_tools.pipeline import run
 from hdmap_tools.readers.open_drive import open_drive
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 
@@ -24,9 +24,7 @@ def run_folder(data_root, tmp_path_factory):
     pytest.importorskip("openvino", reason="the keyframe's network is an OpenVINO model")
     folder = tmp_path_factory.mktemp("keyframe")
     for name in ("one", "two"):
-        with pytest.raises(SystemExit) as stop:
-            main(["run", str(data_root / "nuscenes"), "-o", str(folder / name), "--no-cache"])
-        assert stop.value.code == 0
+        run(data_root / "nuscenes", folder / name, Config())
     return folder
 
 

@@ -1,5 +1,6 @@
 """A small drive with known truth on disk, and the command line to use it."""
 
+import logging
 import shutil
 from pathlib import Path
 
@@ -62,6 +63,16 @@ def street(street_template, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def logging_as_before():
+    """The command line sets up logging for its process; other tests must not see that."""
+    logger = logging.getLogger("hdmap_tools")
+    before = logger.handlers[:], logger.level
+    yield
+    logger.handlers[:] = before[0]
+    logger.setLevel(before[1])
 
 
 @pytest.fixture
