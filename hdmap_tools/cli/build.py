@@ -34,22 +34,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     """
     from hdmap_tools.pipeline import Steps, build_alone
 
-    config = options.resolve_config(
-        given["config_path"],
-        given["settings"],
-        cameras=given["cameras"],
-        origin=given["origin"],
-        drive__layout=given["layout"],
-        drive__scene=given["scene"],
-        segmentation__model=given["model"],
-        segmentation__profile=given["profile"],
-        segmentation__labels=given["labels"],
-        segmentation__label_set=given["label_set"],
-        association__method=given["association"],
-        association__also=[],
-        export__formats=[],
-        fusion__resolution_m=given["resolution"],
-    )
+    config = options.resolve_config(given, association__also=[], export__formats=[])
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
         report = build_alone(
             given["drive"],

@@ -34,15 +34,7 @@ def command(**given: Any) -> None:
     """
     from hdmap_tools.pipeline import compare_alone
 
-    config = options.resolve_config(
-        given["config_path"],
-        given["settings"],
-        cameras=given["cameras"],
-        drive__layout=given["layout"],
-        drive__scene=given["scene"],
-        compare__max_range_m=given["max_range"],
-        observation__confusion=given["confusion"],
-    )
+    config = options.resolve_config(given)
     comparison = compare_alone(
         given["candidate"],
         given["reference"],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
@@ -108,22 +108,32 @@ def json_option(function: F) -> F:
     )
 
 
-def resolve_config(
-    config_path: Path | None,
-    settings: tuple[str, ...] = (),
-    *,
-    cameras: tuple[str, ...] = (),
-    origin: str | None = None,
-    **overrides: Any,
-) -> Config:
+_FIELD_OF_OPTION: Final = {
+    "layout": "drive.layout",
+    "scene": "drive.scene",
+    "cameras": "drive.cameras",
+    "model": "segmentation.model",
+    "profile": "segmentation.profile",
+    "labels": "segmentation.labels",
+    "label_set": "segmentation.label_set",
+    "association": "association.method",
+    "also": "association.also",
+    "resolution": "fusion.resolution_m",
+    "confusion": "observation.confusion",
+    "vectorizers": "vectorize.vectorizers",
+    "reference": "compare.reference",
+    "max_range": "compare.max_range_m",
+}
+"""The field of the configuration that an option of that parameter name sets, in every command."""
+
+
+def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
     """The configuration from a file, --set, and a command's own options (these win).
 
     Args:
-        config_path: hdmap.yaml, or None.
-        settings: ``step.field=value`` texts; values are read as YAML.
-        cameras: Of --camera.
-        origin: Of --origin.
-        overrides: Values by dotted name with ``__`` for the dot; None is not given.
+        given: A command's parameters by name; those in `_FIELD_OF_OPTION` that were
+            given on the command line are put over the file.
+        fixed: What the command itself settles, by dotted name with ``__`` for the dot.
     """
     import yaml
 
@@ -131,7 +141,7 @@ def resolve_config(
     from hdmap_tools.errors import ConfigError
 
     dotted: dict[str, Any] = {}
-    for setting in settings:
+    for setting in given["settings"]:
         name, equals, value = setting.partition("=")
         if not equals or not name.strip():
             raise ConfigError(f"--set {setting!r}: expected STEP.FIELD=VALUE.")
@@ -139,14 +149,20 @@ def resolve_config(
             dotted[name.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise ConfigError(f"--set {setting!r}: the value is not YAML: {error}") from error
-    for name, value in overrides.items():
-        if value is not None:
-            dotted[name.replace("__", ".")] = str(value) if isinstance(value, Path) else value
-    if cameras:
-        dotted["drive.cameras"] = list(cameras)
-    if origin is not None:
-        dotted["export.origin"] = parse_origin(origin)
-    return load_config(config_path, dotted)
+    for option, field in _FIELD_OF_OPTION.items():
+        value = given.get(option)
+        if value is not None and value != ():
+            dotted[field] = _plain(value)
+    if given.get("origin") is not None:
+        dotted["export.origin"] = parse_origin(given["origin"])
+    dotted |= {name.replace("__", "."): value for name, value in fixed.items()}
+    return load_config(given["config_path"], dotted)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    return list(value) if isinstance(value, tuple) else value
 
 
 def parse_origin(text: str) -> list[float]:

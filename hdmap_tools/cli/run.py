@@ -48,22 +48,7 @@ def command(ctx: click.Context, /, **given: Any) -> int:
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
     from hdmap_tools.pipeline import Steps, run
 
-    config = options.resolve_config(
-        given["config_path"],
-        given["settings"],
-        cameras=given["cameras"],
-        origin=given["origin"],
-        drive__layout=given["layout"],
-        drive__scene=given["scene"],
-        segmentation__model=given["model"],
-        segmentation__profile=given["profile"],
-        segmentation__labels=given["labels"],
-        segmentation__label_set=given["label_set"],
-        association__method=given["association"],
-        association__also=list(given["also"]) or None,
-        fusion__resolution_m=given["resolution"],
-        compare__reference=given["reference"],
-    )
+    config = options.resolve_config(given)
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
         result = run(
             given["drive"],

@@ -33,17 +33,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     from hdmap_tools.pipeline import open_configured
     from hdmap_tools.segmentation.open_segmenter import open_segmenter
 
-    config = options.resolve_config(
-        given["config_path"],
-        given["settings"],
-        cameras=given["cameras"],
-        drive__layout=given["layout"],
-        drive__scene=given["scene"],
-        segmentation__model=given["model"],
-        segmentation__profile=given["profile"],
-        segmentation__labels=given["labels"],
-        segmentation__label_set=given["label_set"],
-    )
+    config = options.resolve_config(given)
     drive = open_configured(config, given["drive"])
     require_images(drive)
     segmenter = open_segmenter(config.segmentation, drive)

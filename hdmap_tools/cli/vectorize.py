@@ -34,12 +34,7 @@ def command(**given: Any) -> int:
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
     from hdmap_tools.pipeline import vectorize_alone
 
-    config = options.resolve_config(
-        given["config_path"],
-        given["settings"],
-        vectorize__vectorizers=list(given["vectorizers"]) or None,
-        observation__confusion=given["confusion"],
-    )
+    config = options.resolve_config(given)
     result = vectorize_alone(
         given["semantic_map"], given["out"], config, overwrite=given["overwrite"]
     )
