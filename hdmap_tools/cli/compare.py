@@ -16,7 +16,11 @@ from hdmap_tools.cli import options
 @click.option(
     "--drive", type=options.PATH, help="The drive; only cells near its path are compared (40 m)."
 )
-@click.option("--max-range", type=float, help="How near to the driven path, metres [default: 40].")
+@click.option(
+    "--max-range",
+    type=float,
+    help="How near to the driven path, metres; needs --drive [default: 40].",
+)
 @click.option("--confusion", type=options.PATH, help="Confusion matrix to read the map with.")
 @options.drive_options
 @options.overwrite_option
@@ -28,10 +32,14 @@ def command(**given: Any) -> None:
     \b
     Examples:
       hdmap compare out/semantic_map drivable_mask.png --picture agreement.png
-      hdmap compare map reference.osm --json scores.json
+      hdmap compare map reference.osm --json scores.json --drive path/to/drive --max-range 25
 
     CANDIDATE is a semantic map; REFERENCE a mask PNG with its JSON, or a vector map.
     """
+    if given["max_range"] is not None and given["drive"] is None:
+        raise click.UsageError(
+            "--max-range counts from the driven path: give the drive too, with --drive."
+        )
     from hdmap_tools.pipeline import compare_alone
 
     config = options.resolve_config(given)

@@ -16,8 +16,7 @@ from hdmap_tools.cli import options
     "--format",
     "format_name",
     type=click.Choice(["lanelet2", "geojson", "gpkg"]),
-    default="lanelet2",
-    show_default=True,
+    help="Format [default: by OUT's suffix: .osm lanelet2, .geojson and .json geojson, .gpkg gpkg].",
 )
 @options.origin_option
 @options.overwrite_option
@@ -28,16 +27,17 @@ def command(**given: Any) -> None:
     \b
     Examples:
       hdmap export out/features.gpkg -o lanelet2_map.osm
-      hdmap export features.gpkg -o map.geojson --format geojson --origin 49.01,8.43
+      hdmap export out/features.gpkg -o map.geojson
 
     VECTOR_MAP is a GeoPackage, GeoJSON or Lanelet2 file.
     """
     from dataclasses import replace
 
     from hdmap_tools.errors import ConfigError
-    from hdmap_tools.formats.by_name import read_vector_map, write_vector_map
+    from hdmap_tools.formats.by_name import output_format, read_vector_map, write_vector_map
     from hdmap_tools.geometry.map_frame import MapFrame
 
+    format_name = output_format(given["out"], given["format_name"])
     vector_map = read_vector_map(given["vector_map"])
     if given["origin"] is not None:
         if vector_map.frame.is_georeferenced:
@@ -47,9 +47,9 @@ def command(**given: Any) -> None:
             )
         lat, lon, alt = options.parse_origin(given["origin"])
         vector_map = replace(vector_map, frame=MapFrame.from_origin(lat, lon, alt))
-    write_vector_map(vector_map, given["out"], given["format_name"], overwrite=given["overwrite"])
+    write_vector_map(vector_map, given["out"], format_name, overwrite=given["overwrite"])
     counts = vector_map.counts()
-    options.write_json(given["json_path"], {"format": given["format_name"], "num_elements": counts})
+    options.write_json(given["json_path"], {"format": format_name, "num_elements": counts})
     click.echo(
         f"{', '.join(f'{n} {name}' for name, n in counts.items()) or 'No elements'} in {given['out']}"
     )

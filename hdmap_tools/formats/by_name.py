@@ -69,11 +69,11 @@ def write_vector_map(
     """Write a map in a format by name (`FORMAT_SUFFIXES`); None takes it from the suffix.
 
     Raises:
-        FormatError: If the format is unknown or cannot hold the map.
+        FormatError: As `output_format`, or if the format cannot hold the map.
         NoOriginError: If a geographic format is asked of a map without an origin.
         OutputExistsError: If the file exists and overwrite is False.
     """
-    name = _NAME_OF_SUFFIX.get(Path(path).suffix.lower()) if format_name is None else format_name
+    name = output_format(path, format_name)
     if name == "gpkg":
         from hdmap_tools.formats.gpkg import write_gpkg
 
@@ -82,15 +82,36 @@ def write_vector_map(
         from hdmap_tools.formats.lanelet2 import write_lanelet2
 
         write_lanelet2(vector_map, path, overwrite=overwrite)
-    elif name == "geojson":
+    else:
         from hdmap_tools.formats.geojson import write_geojson
 
         write_geojson(vector_map, path, overwrite=overwrite)
-    else:
-        asked = repr(format_name) if format_name is not None else f"suffix {Path(path).suffix!r}"
+
+
+def output_format(path: str | os.PathLike[str], format_name: str | None = None) -> str:
+    """Name of the format to write a file in: its suffix says it, or `format_name` for another suffix.
+
+    Raises:
+        FormatError: If neither says it, the name is unknown, or suffix and name disagree:
+            every reader goes by the suffix, so such a file could not be read again.
+    """
+    suffix = Path(path).suffix
+    of_suffix = _NAME_OF_SUFFIX.get(suffix.lower())
+    if format_name is None and of_suffix is None:
         raise FormatError(
-            f"No format {asked} to write; expected one of {', '.join(FORMAT_SUFFIXES)}."
+            f"{path} has the suffix {suffix!r}, which says no format; end it in {_suffixes()}, or "
+            f"name one of {', '.join(FORMAT_SUFFIXES)} with --format."
         )
+    if format_name is not None and format_name not in FORMAT_SUFFIXES:
+        raise FormatError(
+            f"No format {format_name!r} to write; expected one of {', '.join(FORMAT_SUFFIXES)}."
+        )
+    if format_name is not None and of_suffix not in (None, format_name):
+        raise FormatError(
+            f"{path} ends in {suffix}, which is {of_suffix}, but the format asked for is "
+            f"{format_name}; end it in {FORMAT_SUFFIXES[format_name]}, or leave --format out."
+        )
+    return of_suffix or str(format_name)
 
 
 def _suffixes() -> str:

@@ -7,9 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from shapely.geometry import LineString
 
 from hdmap_tools.cli.main import main
 from hdmap_tools.geometry.se3 import SE3, Trajectory
+from hdmap_tools.map_model.elements import LaneMark
 from hdmap_tools.readers.drive import Sweep
 from hdmap_tools.testing.drives import write_nuscenes
 from hdmap_tools.testing.street import Street, camera, flat, stripes
@@ -107,3 +109,9 @@ def fails(hdmap):
 
 
 LABELS = ("--labels", "labels", "--label-set", "adas-0001")
+
+
+@pytest.fixture
+def mark() -> LaneMark:
+    """One lane mark, 10 m long."""
+    return LaneMark(id="mark", geometry=LineString([(0, 0, 0), (10, 0, 0)]), style="dashed")
