@@ -48,6 +48,7 @@ ROUND_TRIP_M: Final = 1e-9
 _METADATA_KEY: Final = "hdmap_tools"
 _GDAL_SETTINGS: Final = {
     "OGR_CURRENT_DATE": "2000-01-01T00:00:00.000Z",  # written in place of the time of day
+    "GDAL_PAM_ENABLED": "NO",  # or reading leaves FILE.aux.xml beside a file
     "OGR_SQLITE_SYNCHRONOUS": "OFF",  # the finished file is synced once, before its rename
 }
 _gdal_lock = threading.Lock()  # GDAL's configuration is one for the whole process
@@ -263,7 +264,7 @@ def _is_same_place(frame: MapFrame, crs: CRS) -> bool:
 
 @contextlib.contextmanager
 def _pyogrio_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """GDAL with a fixed clock; its errors become one line of ours."""
+    """GDAL with our settings, the user's again afterwards; its errors become one line of ours."""
     import pyogrio
     from pyogrio.errors import (
         DataLayerError,

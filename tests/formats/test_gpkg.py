@@ -134,6 +134,25 @@ def test_gdal_settings_are_put_back(vector_map: VectorMap, tmp_path: Path) -> No
     assert pyogrio.get_gdal_config_option("OGR_CURRENT_DATE") is None
 
 
+@pytest.mark.parametrize("mode", [0o755, 0o555])
+def test_reading_leaves_nothing_beside_the_file(
+    mode: int, vector_map: VectorMap, tmp_path: Path
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    path = folder / "a.gpkg"
+    write_gpkg(vector_map, path)
+    before = path.read_bytes()
+    path.chmod(mode & 0o666)
+    folder.chmod(mode)
+    try:
+        assert_same(vector_map, read_gpkg(path), 1e-9)
+        assert [p.name for p in folder.iterdir()] == ["a.gpkg"]
+        assert path.read_bytes() == before
+    finally:
+        folder.chmod(0o755)
+
+
 def test_text_that_a_geopackage_cuts_is_refused(frame: MapFrame, tmp_path: Path) -> None:
     mark = LaneMark(id="m", geometry=LineString([(0, 0, 0), (1, 0, 0)]), plugin="a\0b")
     with pytest.raises(FormatError, match=r"attributes of lane_mark 'm'"):
