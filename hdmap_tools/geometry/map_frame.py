@@ -5,7 +5,7 @@ from __future__ import annotations
 import reprlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from hdmap_tools.types import NDArrayFloat
 
 if TYPE_CHECKING:
     from pyproj import CRS, Transformer
+
+CITY_CRS_NAME: Final = "hdmap city frame"
+"""Name of a projection made on an origin, as QGIS shows it; PROJ alone calls it "unknown"."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +64,12 @@ class MapFrame:
                 f"Origin latitude {lat_deg}, longitude {lon_deg} is not usable: expected latitude "
                 "-85..85 and longitude -180..180 degrees, in this order."
             )
-        crs = CRS.from_proj4(
+        unnamed = CRS.from_proj4(
             # float(): the repr of a numpy number is not a number to PROJ.
             f"+proj=tmerc +lat_0={float(lat_deg)!r} +lon_0={float(lon_deg)!r} +k=1 +x_0=0 +y_0=0 "
             "+datum=WGS84 +units=m +no_defs"
         )
+        crs = CRS.from_json_dict({**unnamed.to_json_dict(), "name": CITY_CRS_NAME})
         return cls(crs.to_wkt(), (0.0, 0.0, float(alt_m)), vertical_datum)
 
     @classmethod
@@ -179,34 +183,37 @@ class MapFrame:
         same_offset = np.allclose(self.offset_m, other.offset_m, rtol=0, atol=1e-6)
         same_datum = self.crs_wkt is None or self.vertical_datum == other.vertical_datum
         if not (same_crs and same_offset and same_datum):
-            raise CRSMismatchError(
-                f"Two frames were mixed: {self.describe()} and {other.describe()}."
-            )
+            one, two = self.describe(), other.describe()
+            if one == two:  # they differ by less than people are shown
+                one, two = self.describe(decimals=12), other.describe(decimals=12)
+            raise CRSMismatchError(f"Two frames were mixed: {one} and {two}.")
 
-    def describe(self) -> str:
-        """One line for people."""
-        x, y, z = self.offset_m
+    def describe(self, decimals: int = 6) -> str:
+        """One line for people.
+
+        Args:
+            decimals: Of degrees (6 are 0.1 m); metres get half as many.
+        """
+        shift = ", ".join(f"{v:.{decimals // 2}f}" for v in self.offset_m)
         if self.crs_wkt is None:
-            shift = f" shifted by ({x:.3f}, {y:.3f}, {z:.3f})" if any(self.offset_m) else ""
-            return "local metres without an origin" + shift
-        # The name alone is "unknown" for a projection made on an origin.
-        name = self.crs.name
-        if name == "unknown":
-            lat, lon = self._projection_centre
-            name = f"a projection on latitude {lat:.8f}, longitude {lon:.8f}"
-        return (
-            f"{name} with city origin at ({x:.3f}, {y:.3f}, {z:.3f}), heights above "
-            f"{self.vertical_datum}"
-        )
+            moved = f" shifted by ({shift})" if any(self.offset_m) else ""
+            return "local metres without an origin" + moved
+        moved = f" with city origin at ({shift})" if any(self.offset_m) else ""
+        return f"{self._projection(decimals)}{moved}, heights above {self.vertical_datum}"
 
-    @property
-    def _projection_centre(self) -> tuple[float, float]:
+    def _projection(self, decimals: int) -> str:
+        """The name of the CRS; of a projection made on an origin, what it is and where."""
+        if self.crs.name not in (CITY_CRS_NAME, "unknown"):
+            return self.crs.name
         operation = self.crs.coordinate_operation
-        values = {p.name: p.value for p in operation.params} if operation else {}
-        return (
-            float(values.get("Latitude of natural origin", float("nan"))),
-            float(values.get("Longitude of natural origin", float("nan"))),
-        )
+        values = {p.name: float(p.value) for p in operation.params} if operation else {}
+        lat = values.get("Latitude of natural origin")
+        lon = values.get("Longitude of natural origin")
+        method = operation.method_name if operation else "unnamed projection"
+        if lat is None or lon is None:
+            return method
+        method = "transverse Mercator" if method == "Transverse Mercator" else method
+        return f"{method} at latitude {lat:.{decimals}f}, longitude {lon:.{decimals}f}"
 
 
 def _checked(points: NDArrayFloat) -> NDArrayFloat:

@@ -183,3 +183,37 @@ def test_points_without_a_place_are_refused() -> None:
 
 def test_no_points() -> None:
     assert FRAMES["karlsruhe"].to_wgs84(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_the_crs_has_a_name_that_people_see_in_other_programs() -> None:
+    frame = FRAMES["singapore"]
+    assert frame.crs.name == "hdmap city frame"
+    # What was written without the name is the same place.
+    unnamed = CRS.from_json_dict({**frame.crs.to_json_dict(), "name": "unknown"})
+    frame.require_same(MapFrame(unnamed.to_wkt()))
+    assert MapFrame(unnamed.to_wkt()).describe() == frame.describe()
+
+
+def test_a_frame_is_described_as_briefly_as_it_can_be() -> None:
+    frame = MapFrame.from_origin(1.2882100868743724, 103.78475189208984)
+    said = "transverse Mercator at latitude 1.288210, longitude 103.784752"
+    assert frame.describe() == f"{said}, heights above WGS84"
+    higher = MapFrame.from_origin(1.2882100868743724, 103.78475189208984, 12.5, "EGM2008")
+    assert higher.describe() == (
+        f"{said} with city origin at (0.000, 0.000, 12.500), heights above EGM2008"
+    )
+    assert FRAMES["none"].describe() == "local metres without an origin"
+    assert FRAMES["utm"].describe() == "WGS 84 / UTM zone 32N, heights above WGS84"
+
+
+def test_a_projection_without_a_name_of_another_kind_is_described() -> None:
+    frame = MapFrame.from_crs("+proj=lcc +lat_1=33 +lat_2=45 +lat_0=23 +lon_0=-96 +datum=WGS84")
+    assert frame.describe() == "Lambert Conic Conformal (2SP), heights above WGS84"
+
+
+def test_frames_that_differ_by_a_millimetre_are_told_apart() -> None:
+    near = MapFrame.from_origin(KARLSRUHE[0] + 1e-8, KARLSRUHE[1])
+    with pytest.raises(CRSMismatchError) as caught:
+        FRAMES["karlsruhe"].require_same(near)
+    one, two = str(caught.value).removeprefix("Two frames were mixed: ").split(" and ")
+    assert one != two
