@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hdmap_tools.output_folder import MARKER, output_folder
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
 from hdmap_tools.segmentation.label_png import write_label_png
+from hdmap_tools.segmentation.precomputed import LABEL_SET_NAME, MODEL_NAME
 from hdmap_tools.segmentation.segmenter import Segmenter
 
 
@@ -26,7 +28,7 @@ def write_label_folder(
     overwrite: bool = False,
     progress: SegmentProgress | None = None,
 ) -> dict[str, Any]:
-    """Segment all images of a drive and write their label images.
+    """Segment all images of a drive; write their label images, label set and model's name.
 
     Returns:
         Number of images, share of pixels by label, milliseconds an image.
@@ -40,7 +42,9 @@ def write_label_folder(
             write_label_png(path, labels)
             pixels += np.bincount(labels.reshape(-1), minlength=256)
         document = segmenter.label_set.model_dump_json(indent=2) + "\n"
-        (folder / "label_set.json").write_text(document, encoding="utf-8")
+        (folder / LABEL_SET_NAME).write_text(document, encoding="utf-8")
+        made_by = json.dumps({"model": segmenter.name}, indent=2) + "\n"
+        (folder / MODEL_NAME).write_text(made_by, encoding="utf-8")
         (folder / MARKER).write_text(config.to_yaml(), encoding="utf-8")
     return {
         "num_images": len(drive.images),

@@ -24,9 +24,10 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     \b
     Examples:
       hdmap segment path/to/drive -o labels --model road-segmentation-adas-0001.xml
-      hdmap run path/to/drive -o out --labels labels --label-set adas-0001
+      hdmap run path/to/drive -o out --labels labels
 
-    Writes OUT/CAMERA/TIMESTAMP_NS.png (uint8 ids) and OUT/label_set.json.
+    Writes OUT/CAMERA/TIMESTAMP_NS.png (uint8 ids), OUT/label_set.json (what the ids
+    mean) and OUT/model.json (what made them).
     """
     from hdmap_tools.label_folder import write_label_folder
     from hdmap_tools.mapping import require_images

@@ -9,7 +9,7 @@ from pathlib import Path
 from hdmap_tools.config import SegmentationConfig
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.camera import PinholeCamera
-from hdmap_tools.labels.label_set import load_label_set
+from hdmap_tools.labels.label_set import LabelSet, load_label_set
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.model_profile import (
     find_profile,
@@ -18,7 +18,11 @@ from hdmap_tools.segmentation.model_profile import (
     weights_file,
 )
 from hdmap_tools.segmentation.network import NetworkSegmenter
-from hdmap_tools.segmentation.precomputed import PrecomputedSegmenter
+from hdmap_tools.segmentation.precomputed import (
+    LABEL_SET_NAME,
+    PrecomputedSegmenter,
+    require_label_folder,
+)
 from hdmap_tools.segmentation.segmenter import Segmenter
 
 _log = logging.getLogger(__name__)
@@ -32,7 +36,7 @@ _HOW_TO_GIVE = (
 def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
     """The segmenter for a drive.
 
-    Label PNGs if a folder of them is given, else the model given, else the one
+    Label PNGs if a folder of them is given (their label set may lie in it), else the model given, else the one
     model with a known profile in ``models/`` in the drive's folder, beside it,
     or in the working directory.
 
@@ -48,12 +52,8 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
                 f"Both a model ({config.model}) and label images ({config.labels}) are given; "
                 "leave one out."
             )
-        if config.label_set is None:
-            raise ConfigError(
-                f"What the ids in the label images in {config.labels} mean is not said; name their "
-                "label set with --label-set."
-            )
-        return PrecomputedSegmenter(config.labels, load_label_set(config.label_set), drive.cameras)
+        label_set = label_set_of(config.labels, config.label_set)
+        return PrecomputedSegmenter(config.labels, label_set, drive.cameras)
     model = config.model
     if model is None:
         model = find_model(drive.root)
@@ -66,6 +66,23 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
             "out, or name it in a profile of your own."
         )
     return segmenter
+
+
+def label_set_of(labels: Path, given: str | None) -> LabelSet:
+    """The label set given (a name or a JSON file), or the one in a folder of label images.
+
+    Raises:
+        ConfigError: If there is neither, or no such folder.
+        LabelError: If the label set cannot be read.
+    """
+    require_label_folder(labels)
+    beside = labels / LABEL_SET_NAME
+    if given is None and not beside.is_file():
+        raise ConfigError(
+            f"What the ids in the label images in {labels} mean is not said; name their label set "
+            f"with --label-set, or put it there as {LABEL_SET_NAME}."
+        )
+    return load_label_set(beside if given is None else given)
 
 
 def open_model(

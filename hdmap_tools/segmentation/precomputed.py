@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.camera import PinholeCamera
@@ -14,40 +16,53 @@ from hdmap_tools.segmentation.label_png import read_label_png
 from hdmap_tools.segmentation.network import camera_of
 from hdmap_tools.types import NDArrayByte
 
+LABEL_SET_NAME: Final = "label_set.json"
+"""In a folder of label images: what their ids mean."""
+MODEL_NAME: Final = "model.json"
+"""In a folder of label images: ``{"model": NAME}``, what made them."""
+
 
 def label_path(folder: Path, image: ImageRef) -> Path:
     """Where an image's labels lie: ``<folder>/<camera>/<timestamp_ns>.png``."""
     return folder / image.camera / f"{image.timestamp_ns}.png"
 
 
+def require_label_folder(folder: Path) -> None:
+    """Raise `ConfigError` unless there is such a folder."""
+    if not folder.is_dir():
+        raise ConfigError(
+            f"There is no folder of label images {folder}; it must hold "
+            "<camera>/<timestamp_ns>.png."
+        )
+
+
 class PrecomputedSegmenter:
     """Reads label PNGs, each checked against its image's size and the label set; a `Segmenter`.
 
     Args:
-        folder: Holds ``<camera>/<timestamp_ns>.png``, 8-bit single channel.
+        folder: Holds ``<camera>/<timestamp_ns>.png``, 8-bit single channel, and may
+            hold `MODEL_NAME`.
         label_set: What the ids in them mean.
         cameras: Cameras by name, for the size of their images.
 
     Raises:
-        ConfigError: If the folder does not exist.
+        ConfigError: If the folder does not exist, or says what made it in a way that
+            cannot be read.
     """
 
     def __init__(
         self, folder: Path, label_set: LabelSet, cameras: Mapping[str, PinholeCamera]
     ) -> None:
-        if not folder.is_dir():
-            raise ConfigError(
-                f"There is no folder of label images {folder}; it must hold "
-                "<camera>/<timestamp_ns>.png."
-            )
+        require_label_folder(folder)
         self.folder = folder
         self._label_set = label_set
         self._cameras = cameras
+        self._name = _model_of(folder)
 
     @property
     def name(self) -> str:
-        """``precomputed``: what made the labels is not known."""
-        return "precomputed"
+        """The model that made the labels, where the folder says it, else ``precomputed``."""
+        return self._name
 
     @property
     def label_set(self) -> LabelSet:
@@ -78,3 +93,19 @@ class PrecomputedSegmenter:
         labels = read_label_png(path, size_px=(camera.width_px, camera.height_px))
         self._label_set.check(labels, f"Label image {path}")
         return labels
+
+
+def _model_of(folder: Path) -> str:
+    path = folder / MODEL_NAME
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return "precomputed"
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}. Remove it, or mend it.") from error
+    name = document.get("model") if isinstance(document, dict) else None
+    if not isinstance(name, str) or not name:
+        raise ConfigError(
+            f'{path} does not say what made the labels; expected {{"model": "NAME"}}.'
+        )
+    return name

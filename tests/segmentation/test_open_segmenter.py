@@ -10,6 +10,7 @@ import pytest
 
 from hdmap_tools.config import SegmentationConfig
 from hdmap_tools.errors import ConfigError, LabelError
+from hdmap_tools.labels.label_set import load_label_set
 from hdmap_tools.segmentation import model_profile
 from hdmap_tools.segmentation.network import NetworkSegmenter
 from hdmap_tools.segmentation.open_segmenter import find_model, open_segmenter
@@ -123,6 +124,22 @@ def test_labels_that_exist(drive, label_set_file, tmp_path):
     segmenter = open_segmenter(config, drive)
     assert isinstance(segmenter, PrecomputedSegmenter)
     np.testing.assert_array_equal(segmenter.label_set.names, ["other", "red", "green", "blue"])
+
+
+def test_the_label_set_in_a_folder_of_labels_is_used(drive, label_set_file, tmp_path):
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    shutil.copy(label_set_file, labels / "label_set.json")
+    segmenter = open_segmenter(SegmentationConfig(labels=labels), drive)
+    assert segmenter.label_set == load_label_set(label_set_file)
+    # One that is named wins.
+    named = open_segmenter(SegmentationConfig(labels=labels, label_set="adas-0001"), drive)
+    assert named.label_set == load_label_set("adas-0001")
+
+
+def test_a_folder_of_labels_that_is_missing_is_named_so(drive, tmp_path):
+    with pytest.raises(ConfigError, match=r"no folder of label images .*none"):
+        open_segmenter(SegmentationConfig(labels=tmp_path / "none"), drive)
 
 
 def test_labels_need_their_label_set(drive, tmp_path):

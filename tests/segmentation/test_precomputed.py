@@ -80,3 +80,16 @@ def test_the_fingerprint_follows_the_files(segmenter, drive, labels):
     assert segmenter.fingerprint == before
     write_label_png(label_path(segmenter.folder, drive.images[0]), np.zeros_like(labels))
     assert segmenter.fingerprint != before
+
+
+def test_what_made_the_labels_is_their_name(segmenter, label_set, drive):
+    assert segmenter.name == "precomputed"
+    (segmenter.folder / "model.json").write_text('{"model": "net-7"}')
+    assert PrecomputedSegmenter(segmenter.folder, label_set, drive.cameras).name == "net-7"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"model": ""}', '{"model": 3}', "\ud800"])
+def test_what_made_the_labels_must_be_readable(text, segmenter, label_set):
+    (segmenter.folder / "model.json").write_text(text, errors="surrogatepass")
+    with pytest.raises(ConfigError, match=r"model\.json"):
+        PrecomputedSegmenter(segmenter.folder, label_set, {})
