@@ -57,7 +57,8 @@ class SE3:
     ) -> SE3:
         """From a quaternion, scalar first (normalized here), and a translation in metres."""
         quaternion = np.array([qx, qy, qz, qw], dtype=np.float64)
-        norm = float(np.linalg.norm(quaternion))
+        with np.errstate(over="ignore"):  # an overflow is reported below
+            norm = float(np.linalg.norm(quaternion))
         if not np.isfinite(norm) or norm < 1e-9:
             raise ShapeError(f"Quaternion (w, x, y, z) = {(qw, qx, qy, qz)} has no direction.")
         return cls(Rotation.from_quat(quaternion).as_matrix(), np.asarray(xyz_m, dtype=np.float64))
@@ -177,7 +178,8 @@ class Trajectory:
                 f"{len(times)} pose times need quaternions ({len(times)}, 4) and translations "
                 f"({len(times)}, 3), found {wxyz.shape} and {xyz_m.shape}."
             )
-        norms = np.linalg.norm(wxyz, axis=1)
+        with np.errstate(over="ignore"):  # an overflow is reported below
+            norms = np.linalg.norm(wxyz, axis=1)
         if not np.isfinite(norms).all() or (norms < 1e-9).any():
             row = int(np.flatnonzero(~np.isfinite(norms) | (norms < 1e-9))[0])
             raise PoseError(f"Pose {row} has no usable quaternion: {wxyz[row].tolist()}.")
@@ -237,12 +239,19 @@ class Trajectory:
         if len(self) == 1:
             count = len(times)
             return np.tile(self.rotations, (count, 1, 1)), np.tile(self.translations, (count, 1))
+        # Only the poses around these times: a sweep spans a few of a drive's 100,000.
+        first, last = 0, 1
+        if len(times):
+            first = int(np.searchsorted(self.timestamps_ns, times.min(), side="right")) - 1
+            first = min(first, len(self) - 2)
+            last = max(int(np.searchsorted(self.timestamps_ns, times.max())), first + 1)
+        near = slice(first, last + 1)
         # Relative seconds: nanoseconds since 1970 do not fit a float64.
         origin = self.timestamps_ns[0]
-        knots, query = (self.timestamps_ns - origin) / 1e9, (times - origin) / 1e9
-        rotations = Slerp(knots, Rotation.from_matrix(self.rotations))(query).as_matrix()
+        knots, query = (self.timestamps_ns[near] - origin) / 1e9, (times - origin) / 1e9
+        rotations = Slerp(knots, Rotation.from_matrix(self.rotations[near]))(query).as_matrix()
         translations = np.column_stack(
-            [np.interp(query, knots, self.translations[:, k]) for k in range(3)]
+            [np.interp(query, knots, self.translations[near, k]) for k in range(3)]
         )
         exact = np.searchsorted(self.timestamps_ns, times)
         hit = self.timestamps_ns[exact] == times

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from hdmap_tools.errors import PoseError, ShapeError
 from hdmap_tools.geometry.se3 import SE3, Trajectory
@@ -112,6 +112,71 @@ def test_many_at_once_equal_one_by_one(quarter_turn: Trajectory) -> None:
     assert empty[1].shape == (0, 3)
 
 
+@pytest.fixture(scope="module")
+def long_track() -> Trajectory:
+    """20,000 poses at uneven times, far from the origin."""
+    rng = np.random.default_rng(5)
+    times = START_NS + np.cumsum(rng.integers(1, 10_000_000, 20_000))
+    return Trajectory(
+        times,
+        Rotation.random(len(times), random_state=5).as_matrix(),
+        rng.normal(0, 5000, (len(times), 3)),
+    )
+
+
+def poses_by_all_knots(track: Trajectory, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What SciPy gives when handed the whole trajectory."""
+    times = np.clip(times, track.timestamps_ns[0], track.timestamps_ns[-1])
+    knots, query = ((t - track.timestamps_ns[0]) / 1e9 for t in (track.timestamps_ns, times))
+    rotations = Slerp(knots, Rotation.from_matrix(track.rotations))(query).as_matrix()
+    translations = [np.interp(query, knots, column) for column in track.translations.T]
+    return rotations, np.column_stack(translations)
+
+
+@given(st.data())
+@settings(max_examples=40)
+def test_a_stretch_is_interpolated_as_the_whole_is(
+    long_track: Trajectory, data: st.DataObject
+) -> None:
+    start = data.draw(st.integers(-3, len(long_track) + 3))
+    length = data.draw(st.sampled_from([1, 2, 5, 500, len(long_track)]))
+    knots = long_track.timestamps_ns[np.clip([start, start + length], 0, len(long_track) - 1)]
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    times = rng.integers(knots[0] - 1000, knots[1] + 1000, 30)
+    times = times[
+        ~np.isin(np.clip(times, *long_track.timestamps_ns[[0, -1]]), long_track.timestamps_ns)
+    ]
+    rotations, translations = long_track.interpolate_many(times)
+    by_all = poses_by_all_knots(long_track, times)
+    np.testing.assert_array_equal(rotations, by_all[0])
+    np.testing.assert_array_equal(translations, by_all[1])
+
+
+@pytest.mark.parametrize("at", [-1, 0, 1, 9_999, 19_998, 19_999, 20_000])
+def test_poses_at_and_beside_a_knot(long_track: Trajectory, at: int) -> None:
+    knot = np.clip(at, 0, len(long_track) - 1)
+    time_ns = long_track.timestamps_ns[knot] + (at - knot)  # a nanosecond beyond the ends
+    rotations, translations = long_track.interpolate_many(np.array([time_ns]))
+    np.testing.assert_array_equal(rotations[0], long_track.rotations[knot])
+    np.testing.assert_array_equal(translations[0], long_track.translations[knot])
+
+
+def test_only_the_poses_around_a_time_are_touched(
+    long_track: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    knots_given: list[int] = []
+
+    def counted(knots: np.ndarray, rotations: Rotation) -> Slerp:
+        knots_given.append(len(knots))
+        return Slerp(knots, rotations)
+
+    monkeypatch.setattr("hdmap_tools.geometry.se3.Slerp", counted)
+    times = long_track.timestamps_ns
+    for wanted in ([times[7000] + 1], times[7000:7003] + 1, [times[-1]], [times[0]], []):
+        long_track.interpolate_many(np.array(wanted, dtype=np.int64))
+    assert knots_given == [2, 4, 2, 2, 2]
+
+
 def test_length_is_that_of_the_path_in_the_plane(quarter_turn: Trajectory) -> None:
     assert quarter_turn.length_m == pytest.approx(np.hypot(2.0, 4.0) + 10.0)
     assert len(quarter_turn) == 3
@@ -158,6 +223,7 @@ def test_a_time_span_beyond_int64_is_still_ordered() -> None:
     [
         ([[0.0] * 4, [1, 0, 0, 0]], np.zeros((2, 3)), PoseError, "Pose 0 has no usable quaternion"),
         ([[1, 0, 0, 0], [np.nan] * 4], np.zeros((2, 3)), PoseError, "Pose 1 has no usable"),
+        ([[1, 0, 0, 0], [1e300] * 4], np.zeros((2, 3)), PoseError, "Pose 1 has no usable"),
         ([[1, 0, 0, 0]], np.zeros((2, 3)), ShapeError, r"found \(1, 4\) and \(2, 3\)"),
         ([[1, 0, 0], [1, 0, 0]], np.zeros((2, 3)), ShapeError, r"found \(2, 3\)"),
         ([[1, 0, 0, 0]] * 2, np.zeros((1, 3)), ShapeError, r"and \(1, 3\)"),
