@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from hdmap_plugins.lines import fold_cuts
 from hdmap_plugins.profiles import Stroke
 from hdmap_plugins.sampling import nearest
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
@@ -27,6 +28,8 @@ class JoinRules:
         min_dashes: Fewer make no rhythm.
         rhythm: Share by which dashes and gaps may differ from their median.
         max_angle_deg: Largest angle between a stroke's end and the way to the next.
+        min_solid: Less paint than this is no line by itself.
+        max_fold: A turn of `MAX_TURN_DEG` within this length is a fold, which no line has.
     """
 
     max_gap: float
@@ -36,14 +39,29 @@ class JoinRules:
     min_dashes: int
     rhythm: float
     max_angle_deg: float
+    min_solid: float
+    max_fold: float
 
 
 @dataclass(frozen=True)
 class Line:
-    """Strokes along one line, in order and all in its direction."""
+    """Strokes along one line, in order and all in its direction.
+
+    Attributes:
+        strokes: One, unless it is dashed.
+        is_dashed: Whether they make a rhythm.
+        is_lone: Whether it is too short for a line and nothing in its row says that it
+            is part of one: arrows, letters and fragments are like that.
+    """
 
     strokes: tuple[Stroke, ...]
     is_dashed: bool
+    is_lone: bool = False
+
+    @property
+    def paint(self) -> float:
+        """Painted length, cells."""
+        return sum(s.length for s in self.strokes)
 
 
 @dataclass(frozen=True)
@@ -63,28 +81,80 @@ def join_strokes(strokes: list[Stroke], is_known: NDArrayBool, rules: JoinRules)
     """
     lines: list[Line] = []
     for found in _rows(strokes, rules):
-        row = _fused(found, is_known, rules.min_gap)
+        row = _fused(found, is_known, rules.min_gap, rules)
+        of_row: list[Line] = []
         gaps = [_gap(a, b, is_known) for a, b in pairwise(row)]
         start = 0
         while start < len(row):
             length = _dashed_run(row[start:], gaps[start:], rules)
             if length >= rules.min_dashes:
-                lines.append(Line(tuple(row[start : start + length]), True))
+                of_row.append(Line(tuple(row[start : start + length]), True))
                 start += length
                 continue
             # Unbroken until a gap too long or unknown, or until dashes begin.
             end = start + 1
             while end < len(row) and (_dashed_run(row[end:], gaps[end:], rules) < rules.min_dashes):
                 end += 1
-            lines += [
+            of_row += [
                 Line((stroke,), False)
-                for stroke in _fused(row[start:end], is_known, rules.bridge_gap)
+                for stroke in _fused(row[start:end], is_known, rules.bridge_gap, rules)
             ]
             start = end
+        lines += _with_lone_ones_told(of_row, rules)
     return lines
 
 
-def _fused(row: list[Stroke], is_known: NDArrayBool, max_gap: float) -> list[Stroke]:
+def _with_lone_ones_told(row: list[Line], rules: JoinRules) -> list[Line]:
+    """The lines of one row, those marked that are too short and have no company in it.
+
+    Company is paint beyond a gap no longer than the paint on either side of it (a line
+    that wear or what was not seen has cut into pieces), until there is enough for a
+    line; or dashes in the same row, of the same length, at a multiple of their period.
+    """
+    gaps = [_gap_length(a, b) for a, b in pairwise(row)]
+    is_near = [g <= min(a.paint, b.paint) for g, (a, b) in zip(gaps, pairwise(row), strict=True)]
+    dashed = max((line for line in row if line.is_dashed), key=lambda x: x.paint, default=None)
+    result = []
+    for index, line in enumerate(row):
+        first = last = index
+        while first > 0 and is_near[first - 1]:
+            first -= 1
+        while last < len(row) - 1 and is_near[last]:
+            last += 1
+        beside = gaps[max(index - 1, 0) : index + 1]
+        is_lone = (
+            not line.is_dashed
+            and sum(x.paint for x in row[first : last + 1]) < rules.min_solid
+            and not (dashed is not None and _is_dash_of(dashed, line, beside, rules))
+        )
+        result.append(replace(line, is_lone=is_lone))
+    return result
+
+
+def _is_dash_of(dashed: Line, line: Line, gaps: list[float], rules: JoinRules) -> bool:
+    """Whether a line is one more dash of a row, some of which are missing in between."""
+    dash = float(np.median([s.length for s in dashed.strokes]))
+    between = [
+        _gap_length(Line((a,), False), Line((b,), False)) for a, b in pairwise(dashed.strokes)
+    ]
+    # Unseen gaps may hide dashes, so the shorter half of them is the rhythm's.
+    gap = float(np.quantile(between, 0.25))
+    if abs(line.paint - dash) > rules.rhythm * dash + 2.0:
+        return False
+    period, slack = dash + gap, rules.rhythm * gap + 2.0
+    return any(
+        g >= gap - slack and abs((g - gap) - period * round((g - gap) / period)) <= slack
+        for g in gaps
+    )
+
+
+def _gap_length(a: Line, b: Line) -> float:
+    return float(np.hypot(*(b.strokes[0].xy_cells[0] - a.strokes[-1].xy_cells[-1])))
+
+
+def _fused(
+    row: list[Stroke], is_known: NDArrayBool, max_gap: float, rules: JoinRules
+) -> list[Stroke]:
     """The row with neighbours made one where only a short known gap parts them."""
     result = row[:1]
     for stroke in row[1:]:
@@ -95,9 +165,13 @@ def _fused(row: list[Stroke], is_known: NDArrayBool, max_gap: float) -> list[Str
             result.append(stroke)
             continue
         between = _between(last, stroke)
+        joined = np.vstack([last.xy_cells, between, stroke.xy_cells])
+        if fold_cuts(joined, rules.max_fold):
+            result.append(stroke)
+            continue
         width = (last.width_cells + stroke.width_cells) / 2.0
         result[-1] = Stroke(
-            np.vstack([last.xy_cells, between, stroke.xy_cells]),
+            joined,
             np.concatenate([last.mass, np.full(len(between), width), stroke.mass]),
             # Nothing was seen there: it counts against the line's confidence.
             np.concatenate([last.peak, np.zeros(len(between)), stroke.peak]),

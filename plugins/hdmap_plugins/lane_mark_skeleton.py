@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import shapely
@@ -12,7 +12,14 @@ from shapely.geometry import LineString
 
 from hdmap_plugins.dashes import JoinRules, Line, join_strokes, stations_of
 from hdmap_plugins.lines import MIN_STEP_M, kept_by_simplification, smooth
-from hdmap_plugins.profiles import Stroke, extend_to_ends, meet_at_junctions, refine
+from hdmap_plugins.profiles import (
+    Stroke,
+    extend_to_ends,
+    highest_across,
+    meet_at_junctions,
+    refine,
+    unfolded,
+)
 from hdmap_plugins.sampling import (
     disk,
     fill_small_gaps,
@@ -35,6 +42,9 @@ from hdmap_tools.plugin_api import (
     VectorMap,
 )
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
+
+_MAX_FOLD_M: Final = 1.0
+"""Within this length no painted line turns round, not even at the nose of an island."""
 
 
 class LaneMarkSkeletonOptions(VectorizerOptions):
@@ -62,8 +72,10 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
         min_dashes: Fewer strokes in a row are not called dashed.
         rhythm: Share by which dashes and gaps may differ from their median.
         max_angle_deg: Largest angle between the end of a dash and the way to the next.
-        min_solid_m: An unbroken stroke of at least this length is solid; a shorter
-            one may be a lone dash: its style is unknown.
+        min_solid_m: An unbroken stroke of at least this length is solid. The style of a
+            shorter one is unknown, and alone it is no line.
+        keep_lone_strokes: Report also short strokes that are neither in a row of dashes
+            nor pieces of a longer line; most are arrows, letters and fragments.
         smooth_wavelength_m: Wiggles shorter than this are smoothed.
         simplify_m: Tolerance of leaving out vertices.
     """
@@ -86,6 +98,7 @@ class LaneMarkSkeletonOptions(VectorizerOptions):
     rhythm: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.35
     max_angle_deg: Annotated[float, Field(gt=0.0, le=45.0)] = 15.0
     min_solid_m: Annotated[float, Field(gt=0.0)] = 8.0
+    keep_lone_strokes: bool = False
     smooth_wavelength_m: Annotated[float, Field(gt=0.0, le=50.0)] = 4.0
     simplify_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
 
@@ -95,8 +108,12 @@ class LaneMarkSkeleton(Vectorizer):
 
     The thresholded map only says that there is a line. Where it runs, how wide it is
     and where it ends comes from the probability itself, between cell centres. The
-    geometry is the centre of the paint; its direction means nothing. Stop lines and
-    other narrow cross lines are reported as lane marks too.
+    geometry is the centre of the paint; its direction means nothing. Long stop lines
+    and other narrow cross lines are reported as lane marks too.
+
+    A short stroke by itself is no line, for an arrow without its head looks the same:
+    it needs a row of dashes, or other pieces of its line, unless ``keep_lone_strokes``.
+    The confidence is the mean along the paint of the highest probability across it.
     """
 
     name = "lane_mark_skeleton"
@@ -140,7 +157,13 @@ class LaneMarkSkeleton(Vectorizer):
                 stroke = extend_to_ends(paint, stroke, reach=reach)
                 if stroke.length * resolution >= options.min_stroke_m:
                     strokes.append(stroke)
-        strokes = meet_at_junctions(strokes)
+        max_fold = _MAX_FOLD_M / resolution
+        strokes = [
+            piece
+            for stroke in meet_at_junctions(strokes)
+            for piece in unfolded(stroke, max_fold)
+            if piece.length * resolution >= options.min_stroke_m
+        ]
         rules = JoinRules(
             max_gap=options.max_gap_m / resolution,
             max_dash=options.max_dash_m / resolution,
@@ -149,11 +172,14 @@ class LaneMarkSkeleton(Vectorizer):
             min_dashes=options.min_dashes,
             rhythm=options.rhythm,
             max_angle_deg=options.max_angle_deg,
+            min_solid=options.min_solid_m / resolution,
+            max_fold=max_fold,
         )
         surface = height_surface(window.layer("height"))
         marks = (
-            _lane_mark(line, window, surface, options)
+            _lane_mark(line, window, filled, surface, options)
             for line in join_strokes(strokes, is_known, rules)
+            if options.keep_lone_strokes or not line.is_lone
         )
         return [mark for mark in marks if mark is not None]
 
@@ -239,11 +265,15 @@ def _extents(member: NDArrayBool) -> tuple[float, float]:
 
 
 def _lane_mark(
-    line: Line, window: MapWindow, surface: NDArrayFloat | None, options: LaneMarkSkeletonOptions
+    line: Line,
+    window: MapWindow,
+    probability: NDArrayFloat,
+    surface: NDArrayFloat | None,
+    options: LaneMarkSkeletonOptions,
 ) -> LaneMark | None:
     """The element of one line, or None when it is too short."""
     resolution = window.grid.resolution_m
-    length_m = sum(s.length for s in line.strokes) * resolution
+    length_m = line.paint * resolution
     if length_m < max(options.min_length_m, 2.0 * resolution):
         return None
     xy, is_painted = stations_of(line)
@@ -269,7 +299,7 @@ def _lane_mark(
         style=style,
         width_m=_mean_over_paint([s.width_cells for s in line.strokes], line.strokes) * resolution,
         confidence=float(
-            np.clip(np.mean(np.concatenate([s.peak for s in line.strokes])), 0.0, 1.0)
+            np.mean([p for s in line.strokes for p in highest_across(probability, s.xy_cells)])
         ),
         sigma_m=_sigma_cells(line, votes) * resolution,
         num_observations=votes,

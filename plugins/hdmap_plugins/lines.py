@@ -10,6 +10,9 @@ from scipy.linalg import solveh_banded
 
 from hdmap_tools.types import NDArrayFloat, NDArrayInt
 
+MAX_TURN_DEG: Final = 120.0
+"""A line that turns by more within a short way folds back on itself: no painted line does."""
+
 MIN_STEP_M: Final = 0.05
 """Vertices nearer than this to the one before are left out; Lanelet2's checks warn about them."""
 
@@ -76,6 +79,39 @@ def _whittaker(xy: NDArrayFloat, weights: NDArrayFloat, wavelength: float) -> ND
     bands[1, 1:] = penalty * first
     bands[0, 2:] = penalty
     return np.asarray(solveh_banded(bands, (weights + 1e-6)[:, None] * xy))
+
+
+def fold_cuts(xy: NDArrayFloat, within: float) -> list[int]:
+    """Vertices at which to cut a line so that no piece folds back on itself.
+
+    Args:
+        xy: (N, 2) vertices.
+        within: A turn of more than `MAX_TURN_DEG` over no more than this length is a
+            fold, unit of xy; between two neighbouring segments it always is one.
+
+    Returns:
+        Ascending, without first and last vertex; empty for a line without folds.
+    """
+    steps = np.diff(np.asarray(xy, dtype=np.float64)[:, :2], axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    directions = np.arctan2(steps[:, 1], steps[:, 0])
+    # Without a length there is no direction: keep the one before.
+    has_length = lengths > 1e-9
+    latest = np.maximum.accumulate(np.where(has_length, np.arange(len(steps)), 0))
+    directions = directions[latest]
+    heading = np.unwrap(directions)
+    at = np.concatenate([[0.0], np.cumsum(lengths)])
+    cuts = []
+    start = 0
+    for k in range(1, len(heading)):
+        # Segment j ends at vertex j + 1, segment k begins at vertex k.
+        first = int(np.searchsorted(at[1:k], at[k] - within))
+        first = max(first, start)
+        turn = np.degrees(np.abs(heading[k] - heading[first:k]))
+        if turn.size and turn.max() > MAX_TURN_DEG:
+            start = first + int(np.argmax(np.abs(np.diff(heading[first : k + 1])))) + 1
+            cuts.append(start)
+    return cuts
 
 
 def kept_by_simplification(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -10,7 +11,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString, Point
 
-from hdmap_plugins.lines import smooth
+from hdmap_plugins.lines import fold_cuts, smooth
 from hdmap_plugins.sampling import bilinear
 from hdmap_tools.geometry.polyline import arc_lengths, normals, resample
 from hdmap_tools.types import NDArrayFloat, NDArrayInt
@@ -292,6 +293,35 @@ def _meet_at_last(stroke: Stroke, other: Stroke) -> Stroke:
         mass=np.append(stroke.mass[:keep], np.full(count, typical)),
         peak=np.append(stroke.peak[:keep], np.full(count, float(stroke.peak[keep - 1]))),
     )
+
+
+def unfolded(stroke: Stroke, max_fold: float) -> list[Stroke]:
+    """The stroke cut wherever it would fold back on itself; see `fold_cuts`."""
+    cuts = fold_cuts(stroke.xy_cells, max_fold)
+    if not cuts:
+        return [stroke]
+    bounds = [0, *cuts, len(stroke.xy_cells) - 1]
+    return [
+        replace(
+            stroke,
+            xy_cells=stroke.xy_cells[a : b + 1],
+            mass=stroke.mass[a : b + 1],
+            peak=stroke.peak[a : b + 1],
+            at_junction=(
+                stroke.at_junction[0] and a == 0,
+                stroke.at_junction[1] and b == bounds[-1],
+            ),
+        )
+        for a, b in pairwise(bounds)
+        if b > a
+    ]
+
+
+def highest_across(probability: NDArrayFloat, xy_cells: NDArrayFloat) -> NDArrayFloat:
+    """Highest probability (N,) across a line, within a cell and a half of each station."""
+    across = np.arange(-6, 7) * _ACROSS_STEP
+    places = xy_cells[:, None, :] + across[None, :, None] * normals(xy_cells)[:, None, :]
+    return np.asarray(np.clip(bilinear(probability, places).max(axis=1), 0.0, 1.0))
 
 
 def _normals(xy: NDArrayFloat, is_closed: bool) -> NDArrayFloat:

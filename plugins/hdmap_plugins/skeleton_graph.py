@@ -307,14 +307,21 @@ def _split_at_corners(line: CellLine, reach: int = 6, corner_deg: float = 50.0) 
     """Pieces between sharp bends: smoothing would round them, and no lane mark has any.
 
     They come from the corners of parking bays, and where the ends of two parallel
-    lines touch.
+    lines touch. A ring is cut open there too: around the slit between two parallel
+    lines it is no ring but both of them. One of a few cells is a hole in the mask.
     """
     xy = line.xy_cells
-    if len(xy) < 2 * reach + 1 or bool(np.all(xy[0] == xy[-1])):
-        return [line]
-    before, after = xy[reach:-reach] - xy[: -2 * reach], xy[2 * reach :] - xy[reach:-reach]
-    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    turn = np.abs(np.degrees(np.arctan2(cross, np.einsum("nk,nk->n", before, after))))
+    is_ring = bool(np.all(xy[0] == xy[-1]))
+    if len(xy) < 2 * reach + 1:
+        return [] if is_ring else [line]
+    if is_ring and not any(line.at_junction):
+        ring = xy[:-1]
+        turn = _turns_deg(np.vstack([ring[-reach:], ring, ring[:reach]]), reach)
+        if turn.max() <= corner_deg:
+            return [line]
+        ring = np.roll(ring, -int(np.argmax(turn)), axis=0)
+        xy = np.vstack([ring, ring[:1]])
+    turn = _turns_deg(xy, reach)
     cuts = []
     while turn.size and turn.max() > corner_deg:
         worst = int(np.argmax(turn))
@@ -329,3 +336,11 @@ def _split_at_corners(line: CellLine, reach: int = 6, corner_deg: float = 50.0) 
         for a, b in pairwise(bounds)
         if b > a
     ]
+
+
+def _turns_deg(xy: NDArrayFloat, reach: int) -> NDArrayFloat:
+    """Bend (N - 2 reach,) at each point that has so many on both sides, 0..180."""
+    before, after = xy[reach:-reach] - xy[: -2 * reach], xy[2 * reach :] - xy[reach:-reach]
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    dot = np.einsum("nk,nk->n", before, after)
+    return np.asarray(np.abs(np.degrees(np.arctan2(cross, dot))))

@@ -187,8 +187,119 @@ def test_wear_is_bridged_and_long_known_gaps_are_not():
 
 
 def test_two_strokes_are_no_rhythm():
-    found = marks(scene(painted(*dash_row(1.03, 2, 3, 6, 0.0)), (0, 0, 20, 8), 0.1))
+    window = scene(painted(*dash_row(1.03, 2, 3, 6, 0.0)), (0, 0, 20, 8), 0.1)
+    assert marks(window) == []
+    found = marks(window, keep_lone_strokes=True)
     assert [m.style for m in found] == [MarkStyle.UNKNOWN] * 2
+
+
+@pytest.mark.parametrize("resolution_m", RESOLUTIONS)
+@pytest.mark.parametrize("angle_deg", [0, 17, 45])
+def test_shafts_of_arrows_are_lines_only_when_asked_for(resolution_m, angle_deg):
+    """Three lanes of arrows abreast, one more ahead, beside a dashed and a solid line."""
+    shafts = [LineString([(x, y), (x + 5, y)]) for x, y in ((4, 5), (4, 8.5), (4, 12), (24, 8.5))]
+    dashes = [LineString([(x, 6.75), (x + 3, 6.75)]) for x in (1, 10, 19, 28)]
+    solid = LineString([(1, 10.25), (31, 10.25)])
+
+    def turned(line):
+        return affinity.rotate(line, angle_deg, origin=(16, 16))
+
+    paint = shapely.union_all(
+        [painted(*map(turned, shafts), width_m=0.3), painted(*map(turned, [*dashes, solid]))]
+    )
+    window = scene(paint, (-8, -8, 40, 40), resolution_m)
+    found = marks(window)
+    assert {m.style for m in found} == {MarkStyle.DASHED, MarkStyle.SOLID}
+    assert len(found) == 2
+    lone = [m for m in marks(window, keep_lone_strokes=True) if m.style == MarkStyle.UNKNOWN]
+    assert len(lone) == len(shafts)
+    for shaft in shafts:
+        assert min(end_error(m, turned(shaft)) for m in lone) <= 2 * resolution_m
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_pieces_of_a_line_keep_one_another(hidden):
+    """Worn, or cut by what was not seen: no piece is long enough for a line by itself."""
+    line = LineString([(1, 3.4), (26, 3.4)])
+    gaps = box(7.5, 0, 10, 8).union(box(17, 0, 24, 8))
+    if hidden:
+        window = scene(painted(line), (0, 0, 27, 8), 0.1, unknown=gaps)
+    else:
+        window = scene(painted(line.difference(gaps)), (0, 0, 27, 8), 0.1)
+    # The last one is shorter than the gap before it.
+    assert sorted(round(m.geometry.length, 1) for m in marks(window)) == [6.5, 7.0]
+    assert len(marks(window, keep_lone_strokes=True)) == 3
+
+
+def test_a_dash_beyond_a_missing_one_belongs_to_its_row():
+    dashes = dash_row(1.03, 6, 3, 6, 0.0)
+    found = marks(scene(painted(*dashes[:4], dashes[5]), (0, 0, 52, 8), 0.2))
+    assert sorted(m.style for m in found) == [MarkStyle.DASHED, MarkStyle.UNKNOWN]
+    # As long as a dash, but out of step; in step, but no dash.
+    for stroke in ([(42, 3.4), (45, 3.4)], [(46, 3.4), (51.5, 3.4)]):
+        (mark,) = marks(scene(painted(*dashes[:4], LineString(stroke)), (0, 0, 54, 8), 0.2))
+        assert mark.style == MarkStyle.DASHED
+
+
+def sharpest_turn_deg(mark: LaneMark, within_m: float) -> float:
+    """Largest turn between two segments that begin no farther apart along the line."""
+    xy = shapely.get_coordinates(mark.geometry)
+    steps = np.diff(xy, axis=0)
+    lengths = np.hypot(*steps.T)
+    starts = np.concatenate([[0.0], np.cumsum(lengths)])
+    heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    return max(
+        (
+            float(np.degrees(abs(heading[j] - heading[i])))
+            for i in range(len(steps))
+            for j in range(i + 1, len(steps))
+            if starts[j] - starts[i + 1] <= within_m
+        ),
+        default=0.0,
+    )
+
+
+@pytest.mark.parametrize("resolution_m", RESOLUTIONS)
+@pytest.mark.parametrize("slit_m", [0.8, 1.4, 2.2, 3.0])
+@pytest.mark.parametrize("angle_deg", [0, 25, 45, 70])
+def test_no_line_folds_back_on_itself(resolution_m, slit_m, angle_deg):
+    """A double line that runs together: around the slit between its two the skeleton is a loop."""
+    c = 2 * resolution_m
+    slit = Polygon([(4, 8 - c), (4 + slit_m, 8 - c), (4 + slit_m, 8 + c), (4, 8 + c)]).exterior
+    paint = painted(LineString([(4 + slit_m, 8), (16, 8)]), slit, width_m=1.5 * resolution_m)
+    paint = affinity.rotate(paint, angle_deg, origin=(8, 8))
+    options = {"keep_lone_strokes": True, "min_length_m": 0.0, "min_stroke_m": 0.0}
+    found = marks(scene(paint, (0, 0, 20, 20), resolution_m), **options)
+    assert max(m.geometry.length for m in found) >= 11.5 - slit_m
+    for mark in found:
+        assert sharpest_turn_deg(mark, 1.0) <= 125.0
+        assert mark.geometry.is_simple
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), resolution_m=st.sampled_from(RESOLUTIONS))
+def test_scribbles_do_not_fold_either(seed, resolution_m):
+    rng = np.random.default_rng(seed)
+    starts = rng.uniform(1, 11, (12, 2))
+    paint = painted(
+        *(LineString([a, a + rng.normal(0, 1.5, 2), a + rng.normal(0, 1.5, 2)]) for a in starts)
+    )
+    options = {"keep_lone_strokes": True, "min_length_m": 0.0, "min_stroke_m": 0.0}
+    for mark in marks(scene(paint, (0, 0, 12, 12), resolution_m), **options):
+        assert sharpest_turn_deg(mark, 1.0) <= 125.0
+
+
+def test_confidence_is_the_posterior_on_the_paint():
+    """Not what stands out of the ground: that is 0.19 less where the road is doubtful."""
+    line = LineString([(2, 3.15), (18, 3.15)])
+    window = scene(painted(line, width_m=0.3), (0, 0, 20, 6), 0.1)
+    (sure,) = marks(window)
+    assert sure.confidence == pytest.approx(0.95, abs=0.01)
+    posterior = window.dataset["posterior"].values.copy()
+    posterior[2] = np.where(posterior[2] > 0.5, 0.6, 0.25)
+    posterior[0] = 1.0 - posterior[[1, 2, 3, 4]].sum(axis=0)
+    (doubtful,) = marks(window_from_posterior(posterior, window.grid))
+    assert doubtful.confidence == pytest.approx(0.6, abs=0.01)
 
 
 @pytest.mark.parametrize("angle_deg", [0, 17, 45])
