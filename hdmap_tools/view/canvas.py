@@ -139,6 +139,7 @@ def draw_lines(
     *,
     dash_px: tuple[float, float] | None = None,
     casing_px: float = 0.0,
+    opacity: float = 1.0,
 ) -> None:
     """Draw polylines (N, 2), in continuous pixels, into a picture, in place.
 
@@ -149,6 +150,7 @@ def draw_lines(
         width_px: Of the lines.
         dash_px: (on, off) lengths.
         casing_px: White margin on both sides, so that lines show on any ground.
+        opacity: Of the lines, 0..1.
     """
     shapes = [LineString(uv) for uv in lines if len(uv) >= 2 and np.ptp(uv, axis=0).max() > 1e-9]
     height, width = picture.shape[:2]
@@ -165,7 +167,7 @@ def draw_lines(
     drawn = shapes if dash_px is None else [d for s in shapes for d in _dashes(s, *dash_px)]
     if casing_px > 0:
         fill(picture, _band(drawn, width_px + 2 * casing_px), PAPER, 0.75)
-    fill(picture, _band(drawn, width_px), color)
+    fill(picture, _band(drawn, width_px), color, opacity)
 
 
 def _band(lines: Sequence[LineString], width_px: float) -> BaseGeometry:
@@ -233,15 +235,15 @@ def draw_scale_bar(picture: NDArrayByte, pixels_per_metre: float) -> None:
     steps = [m * 10.0**e for e in range(-2, 6) for m in (1, 2, 5)]
     length_m = max((s for s in steps if s <= longest_m), default=steps[0])
     length_px = length_m * pixels_per_metre
+    k = _furniture_scale(width)
     left, base = 12.0, height - 12.0
     label = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:g} km"
-    back = max(length_px, text_width(label, 0.45)) + 16
-    fill(picture, shapely.box(left - 8, base - 28, left - 8 + back, base + 6), PAPER, 0.8)
-    fill(picture, shapely.box(left, base - 4, left + length_px, base), INK)
-    fill(
-        picture, shapely.box(left + length_px / 2, base - 3, left + length_px - 1, base - 1), PAPER
-    )
-    put_text(picture, label, (left, base - 10), size=0.45)
+    back = max(length_px, text_width(label, 0.45 * k)) + 16
+    fill(picture, shapely.box(left - 8, base - 28 * k, left - 8 + back, base + 6), PAPER, 0.8)
+    fill(picture, shapely.box(left, base - 4 * k, left + length_px, base), INK)
+    white = shapely.box(left + length_px / 2, base - 4 * k + 1, left + length_px - 1, base - 1)
+    fill(picture, white, PAPER)
+    put_text(picture, label, (left, base - 10 * k), size=0.45 * k)
 
 
 def draw_north_arrow(picture: NDArrayByte) -> None:
@@ -249,10 +251,16 @@ def draw_north_arrow(picture: NDArrayByte) -> None:
     height, width = picture.shape[:2]
     if width < 80 or height < 80:
         return
-    u, v = width - 22.0, 12.0
-    fill(picture, shapely.box(u - 14, v - 6, u + 14, v + 42), PAPER, 0.8)
-    fill(picture, shapely.Polygon([(u, v), (u + 8, v + 22), (u, v + 17), (u - 8, v + 22)]), INK)
-    put_text(picture, "N", (u, v + 38), size=0.5, bold=True, anchor="middle")
+    k = _furniture_scale(width)
+    u, v = width - 22.0 * k, 12.0
+    fill(picture, shapely.box(u - 14 * k, v - 6, u + 14 * k, v + 42 * k), PAPER, 0.8)
+    arrow = np.array([(0, 0), (8, 22), (0, 17), (-8, 22)]) * k + (u, v)
+    fill(picture, shapely.Polygon(arrow), INK)
+    put_text(picture, "N", (u, v + 38 * k), size=0.5 * k, bold=True, anchor="middle")
+
+
+def _furniture_scale(width_px: int) -> float:
+    return float(np.clip(width_px / 650, 1.0, 2.0))
 
 
 def write_png(picture: NDArrayByte, path: Path, *, overwrite: bool = False) -> None:

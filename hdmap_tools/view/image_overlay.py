@@ -170,7 +170,11 @@ def _draw_vectors(
             )
         ]
         draw_lines(
-            picture, lines, stroke.color, width_px * stroke.width_px / 2.5, casing_px=width_px / 3
+            picture,
+            lines,
+            stroke.color,
+            width_px * stroke.width_px / 2.5,
+            casing_px=width_px * stroke.casing_px / 2.5,
         )
 
 

@@ -28,7 +28,12 @@ from hdmap_tools.view.canvas import (
 from hdmap_tools.view.page import LegendEntry, TitledPicture, compose
 from hdmap_tools.view.palette import PAPER, PATH, class_color, stroke_of
 
+PANEL_PX: Final = 900
+"""About the size of a map: two side by side make a page of at most 2400 pixels."""
+
+_MAPS_A_ROW: Final = 2
 _MARGIN_M: Final = 2.0
+_LARGER_AT_MOST: Final = 1.3
 _PALEST: Final = 0.4
 """Share of a class's colour left in a cell that knows nothing more than the prior."""
 
@@ -119,7 +124,13 @@ def draw_elements(picture: NDArrayByte, vector_map: VectorMap, viewport: Viewpor
         if element.geometry_type == "Polygon" and stroke.fill > 0:
             fill(picture, shapely.Polygon(lines[0], lines[1:]), stroke.color, stroke.fill)
         draw_lines(
-            picture, lines, stroke.color, stroke.width_px, dash_px=stroke.dash_px, casing_px=0.8
+            picture,
+            lines,
+            stroke.color,
+            stroke.width_px,
+            dash_px=stroke.dash_px,
+            casing_px=stroke.casing_px,
+            opacity=stroke.opacity,
         )
 
 
@@ -132,11 +143,11 @@ def overview_picture(
     city_SE3_ego: SE3 | None = None,
     bounds_m: tuple[float, float, float, float] | None = None,
     title: str = "",
-    panel_px: int = 900,
+    panel_px: int = PANEL_PX,
     image_height_px: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write one page: camera images above, maps side by side below, legend at the foot.
+    """Write one page: camera images above, maps two a row below, legend at the foot.
 
     All maps are drawn over the same ground at the same scale.
 
@@ -178,7 +189,7 @@ def overview_page(
     city_SE3_ego: SE3 | None = None,
     bounds_m: tuple[float, float, float, float] | None = None,
     title: str = "",
-    panel_px: int = 900,
+    panel_px: int = PANEL_PX,
     image_height_px: int | None = None,
 ) -> NDArrayByte:
     """The page of `overview_picture` as (height, width, 3) uint8 RGB."""
@@ -198,11 +209,12 @@ def overview_page(
         )
         for panel in panels
     ]
-    map_width_px = sum(m.picture.shape[1] for m in maps)
+    map_width_px = sum(m.picture.shape[1] for m in maps[:_MAPS_A_ROW])
     height_px = image_height_px or _image_height(images, map_width_px)
     photos = [TitledPicture(i.title, _resized(i, height_px)) for i in images]
     legend = map_legend(panels, has_path=trajectory_xy is not None or city_SE3_ego is not None)
-    return compose([photos, maps], legend, title=title)
+    rows = [maps[i : i + _MAPS_A_ROW] for i in range(0, len(maps), _MAPS_A_ROW)]
+    return compose([photos, *rows], legend, title=title)
 
 
 def known_bounds(windows: Sequence[MapWindow]) -> tuple[float, float, float, float]:
@@ -231,10 +243,14 @@ def known_bounds(windows: Sequence[MapWindow]) -> tuple[float, float, float, flo
 def fitting_scale(
     bounds_m: tuple[float, float, float, float], resolution_m: float, about_px: int
 ) -> float:
-    """Pixels per metre that about fit about_px: a whole number of pixels a cell, unless cells are smaller."""
+    """Pixels per metre that about fit about_px: a whole number of pixels a cell, unless cells are smaller.
+
+    A whole number may make the picture larger than asked, by `_LARGER_AT_MOST`.
+    """
     x0, y0, x1, y1 = bounds_m
     largest = about_px / max(x1 - x0, y1 - y0)
-    whole = np.round(largest * resolution_m)
+    cell_px = largest * resolution_m
+    whole = np.ceil(cell_px) if np.ceil(cell_px) <= cell_px * _LARGER_AT_MOST else np.floor(cell_px)
     return float(whole / resolution_m if whole >= 1 else largest)
 
 

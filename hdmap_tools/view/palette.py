@@ -61,6 +61,8 @@ class Stroke:
         width_px: Of the line, pixels.
         dash_px: (on, off) pixels, or None for an unbroken line.
         fill: Share of the colour inside a polygon, 0..1.
+        casing_px: White margin on both sides.
+        opacity: Of the line, on maps.
     """
 
     name: str
@@ -68,14 +70,20 @@ class Stroke:
     width_px: float
     dash_px: tuple[float, float] | None = None
     fill: float = 0.0
+    casing_px: float = 0.8
+    opacity: float = 1.0
 
 
+# Lane marks are thin, bare, unbroken and let the paint through, their style in the colour: a person
+# wants to hold them against the paint, which is often no wider than a pixel or two.
 _MARKS: Final[dict[MarkStyle, Stroke]] = {
-    MarkStyle.SOLID: Stroke("lane mark, solid", (200, 60, 0), 2.5),
-    MarkStyle.DASHED: Stroke("lane mark, dashed", (0, 84, 166), 2.5, (9.0, 4.0)),
-    MarkStyle.UNKNOWN: Stroke("lane mark, style unknown", (120, 80, 20), 2.5, (2.5, 2.5)),
+    MarkStyle.SOLID: Stroke("lane mark, solid", (214, 40, 0), 1.25, casing_px=0.0, opacity=0.6),
+    MarkStyle.DASHED: Stroke("lane mark, dashed", (0, 70, 255), 1.25, casing_px=0.0, opacity=0.6),
+    MarkStyle.UNKNOWN: Stroke(
+        "lane mark, style unknown", (96, 56, 0), 1.25, casing_px=0.0, opacity=0.6
+    ),
 }
-_DOUBLE_MARK: Final = Stroke("lane mark, double", (150, 0, 60), 4.0)
+_DOUBLE_MARK: Final = Stroke("lane mark, double", (150, 0, 60), 2.0, casing_px=0.0, opacity=0.6)
 _OTHERS: Final[dict[type[MapElement], Stroke]] = {
     Crosswalk: Stroke("crosswalk", (130, 20, 90), 2.0, fill=0.12),
     RoadBoundary: Stroke("road boundary", (30, 30, 34), 2.0),

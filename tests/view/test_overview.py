@@ -3,6 +3,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import shapely
 from shapely.geometry import LineString, Polygon, box
 
 from hdmap_tools.errors import CRSMismatchError, ShapeError
@@ -23,6 +24,7 @@ from hdmap_tools.view.overview import (
     overview_picture,
     render_panel,
 )
+from hdmap_tools.view.page import TitledPicture, compose, text_scale
 from hdmap_tools.view.palette import CLASS_COLORS, PAPER, stroke_of
 
 GRID = BevGrid.from_bounds((-10.0, -10.0, 10.0, 10.0), 0.5)
@@ -75,8 +77,11 @@ def test_a_vector_on_a_cell_edge_is_drawn_on_the_edge_between_the_cells() -> Non
         touched = changed.nonzero()[0]
         assert touched.min() + touched.max() + 1 == 2 * edge
         assert len(touched) <= stroke.width_px + 4
+    stroke = stroke_of(mark)
+    share = stroke.width_px / 2 * stroke.opacity  # half the line in each of the two
     for column in (299, 300):
-        assert distance(lined[230, column], stroke_of(mark).color) <= 1
+        mixed = bare[230, column] * (1 - share) + np.array(stroke.color) * share
+        assert distance(lined[230, column], mixed) <= 1
     for row in (139, 140):
         assert distance(lined[row, 100], stroke_of(north).color) <= 1
 
@@ -192,3 +197,47 @@ def test_refusals() -> None:
     there = BevGrid.from_bounds((-10.0, -10.0, 10.0, 10.0), 0.5, frame)
     with pytest.raises(CRSMismatchError):
         overview_page([Panel("a", window), Panel("b", window_from_shapes({}, there))])
+
+
+def test_a_page_of_many_large_maps_fits_a_screen() -> None:
+    grid = BevGrid.from_bounds((0.0, 0.0, 110.0, 108.0), 0.1)
+    window = window_from_shapes({"road": box(0, 40, 110, 60)}, grid)
+    photo = CameraPicture("front", np.full((563, 1000, 3), 90, dtype=np.uint8))
+    panels = [Panel(name, window) for name in "abcd"]
+    page = overview_page(panels, images=[photo, photo], bounds_m=grid.bounds_m)
+    assert 2000 < page.shape[1] <= 2400
+    # Two rows of maps, a pixel a cell.
+    is_road = (np.abs(page.astype(int) - CLASS_COLORS["road"]).max(axis=2) < 6).sum(axis=1)
+    assert (is_road >= 2 * 1000).sum() == 2 * 200
+
+
+@pytest.mark.parametrize("size_m", [30, 84, 113, 135, 140, 170, 400])
+def test_no_map_is_much_larger_than_asked(size_m: float) -> None:
+    size_px = fitting_scale((0, 0, size_m, size_m), 0.1, 900) * size_m
+    assert 450 <= size_px <= 900 * 1.3 + 1e-9
+
+
+def test_the_paint_under_a_lane_mark_stays_visible() -> None:
+    """Its dashes can be counted along the line that is drawn over them."""
+    dashes = shapely.MultiPolygon([box(x, -0.05, x + 3, 0.05) for x in (-9, -3, 3)])
+    grid = BevGrid.from_bounds((-10.0, -10.0, 10.0, 10.0), 0.1)
+    window = window_from_shapes({"road": box(-10, -3, 10, 3), "lane_mark": dashes}, grid)
+    mark = LaneMark(geometry=LineString([(-9, 0, 0), (6, 0, 0)]), style=MarkStyle.DASHED)
+    drawn = VectorMap(grid.frame, with_stable_ids([mark]))
+    picture = render_panel(Panel("a", window, drawn), grid.bounds_m, 10.0).astype(float)
+    line = picture[[99, 100], 12:158].mean(axis=0)
+    yellow = line[:, 0] - line[:, 2]
+    assert np.ptp(yellow) > 40
+    is_painted = yellow > (yellow.min() + yellow.max()) / 2
+    assert np.count_nonzero(np.diff(is_painted.astype(int)) == 1) + is_painted[0] == 3
+    assert stroke_of(mark).dash_px is None
+
+
+def test_text_grows_with_the_page() -> None:
+    assert text_scale(640) == 1.0
+    assert text_scale(2100) == pytest.approx(1.5)
+    narrow, wide = (
+        compose([[TitledPicture("x", np.full((10, n, 3), 255, np.uint8))]], title="T")
+        for n in (600, 2400)
+    )
+    assert wide.shape[0] > narrow.shape[0]
