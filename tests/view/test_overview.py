@@ -219,7 +219,7 @@ def test_no_map_is_much_larger_than_asked(size_m: float) -> None:
 
 def test_the_paint_under_a_lane_mark_stays_visible() -> None:
     """Its dashes can be counted along the line that is drawn over them."""
-    dashes = shapely.MultiPolygon([box(x, -0.05, x + 3, 0.05) for x in (-9, -3, 3)])
+    dashes = shapely.MultiPolygon([box(x, -0.1, x + 3, 0.1) for x in (-9, -3, 3)])
     grid = BevGrid.from_bounds((-10.0, -10.0, 10.0, 10.0), 0.1)
     window = window_from_shapes({"road": box(-10, -3, 10, 3), "lane_mark": dashes}, grid)
     mark = LaneMark(geometry=LineString([(-9, 0, 0), (6, 0, 0)]), style=MarkStyle.DASHED)
