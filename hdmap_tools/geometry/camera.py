@@ -14,6 +14,10 @@ from hdmap_tools.types import NDArrayBool, NDArrayFloat
 MIN_DEPTH_M: Final = 0.1
 """Nearer points are not projected: the pixel position is dominated by mounting error."""
 
+_MAX_PX: Final = 100_000
+_MAX_NUMBER: Final = 1e6
+"""Far beyond any lens; larger numbers only overflow on the way."""
+
 
 @dataclass(frozen=True, eq=False)
 class Projection:
@@ -71,6 +75,12 @@ class PinholeCamera:
             raise CalibrationError(
                 f"Camera {self.name}: focal lengths ({self.fx}, {self.fy}) and image size "
                 f"({self.width_px}, {self.height_px}) must be positive."
+            )
+        if max(self.width_px, self.height_px) > _MAX_PX or np.abs(numbers).max() > _MAX_NUMBER:
+            raise CalibrationError(
+                f"Camera {self.name}: image size ({self.width_px}, {self.height_px}), intrinsics "
+                f"{numbers[:4]} and distortion {self.distortion} are those of no camera; expected "
+                f"at most {_MAX_PX} pixels and numbers of at most {_MAX_NUMBER:g}."
             )
         object.__setattr__(self, "_max_radius", _monotone_radius(self.distortion))
 

@@ -40,10 +40,13 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
 from hdmap_tools.readers.cameras import mount_from_quaternion, select_cameras
-from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_finite, to_bytes
+from hdmap_tools.readers.checks import MAX_TIME_NS, name_problem, shown
+from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_usable, to_bytes
 from hdmap_tools.readers.feather import read_columns
+from hdmap_tools.readers.folders import os_errors_are_drive_errors
 from hdmap_tools.readers.motion import compensate_ego_motion
 from hdmap_tools.readers.poses import trajectory_from_table
+from hdmap_tools.types import NDArrayAny
 
 logger = logging.getLogger(__name__)
 
@@ -67,9 +70,11 @@ _TRANSLATION: Final = ("tx_m", "ty_m", "tz_m")
 _INTRINSICS: Final = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _LENS: Final = ("k1", "k2", "k3")
 _CITY_IN_MAP_NAME: Final = re.compile(r"____([A-Z]+)_city_")
+_MAX_OFFSET_NS: Final = 1e10
 _IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
 
 
+@os_errors_are_drive_errors()
 def read_av2(
     log_dir: Path,
     cameras: Sequence[str] = (),
@@ -158,17 +163,29 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
     required = ("x", "y", "z", "intensity") + (("offset_ns",) if trajectory is not None else ())
     columns = read_columns(ref.path, required, ("laser_number",), SweepError)
     values = np.column_stack([columns[name].astype(np.float64) for name in columns])
-    values, _, num_dropped = keep_finite(values)
+    values, num_dropped = keep_usable(values)
     if not len(values):
-        found = f"all {num_dropped} points are NaN or infinite" if num_dropped else "it is empty"
+        found = (
+            f"all {num_dropped} points are NaN or infinite, or beyond 10 km"
+            if num_dropped
+            else "it is empty"
+        )
         raise SweepError(f"Sweep {ref.path} has no points: {found}; copy it again or remove it.")
     if num_dropped:
-        logger.warning("%s: dropped %d points that are NaN or infinite", ref.path, num_dropped)
+        logger.warning(
+            "%s: dropped %d points that are NaN, infinite or beyond 10 km", ref.path, num_dropped
+        )
     kept = dict(zip(columns, values.T, strict=True))
     points = np.ascontiguousarray(values[:, :3])
     if trajectory is not None:
+        offsets_ns = kept["offset_ns"]
+        if np.abs(offsets_ns).max() > _MAX_OFFSET_NS:
+            raise SweepError(
+                f"Sweep {ref.path}: offset_ns runs from {offsets_ns.min():g} to "
+                f"{offsets_ns.max():g}; expected those of one turn, within {_MAX_OFFSET_NS:g} ns."
+            )
         points = compensate_ego_motion(
-            points, kept["offset_ns"].astype(np.int64), ref.timestamp_ns, trajectory
+            points, offsets_ns.astype(np.int64), ref.timestamp_ns, trajectory
         )
     ring = kept.get("laser_number", np.zeros(len(points)))
     return Sweep(
@@ -184,6 +201,12 @@ def _read_trajectory(path: Path, warnings: list[str]) -> Trajectory:
     times = columns["timestamp_ns"]
     if not np.issubdtype(times.dtype, np.integer):
         raise PoseError(f"{path}: timestamp_ns is {times.dtype}; expected integer nanoseconds.")
+    if (times >= MAX_TIME_NS).any():  # before the cast: uint64 would wrap
+        row = int(np.flatnonzero(times >= MAX_TIME_NS)[0])
+        raise PoseError(
+            f"Poses in {path} are unusable: row {row} has a time outside 1970 to 2116, ns: "
+            f"{times[row]}; correct or remove it."
+        )
     times = times.astype(np.int64)
     trajectory = trajectory_from_table(
         times,
@@ -218,10 +241,10 @@ def _read_cameras(
         if mounts_path.exists()
         else {"sensor_name": np.empty(0, dtype=object)}
     )
-    row_of_mount = {str(name): row for row, name in enumerate(mounts["sensor_name"])}
+    row_of_mount = _rows_by_sensor(mounts, mounts_path)
     calibrated: dict[str, PinholeCamera] = {}
     unusable: dict[str, DriveError] = {}
-    for row, name in enumerate(str(name) for name in intrinsics["sensor_name"]):
+    for name, row in _rows_by_sensor(intrinsics, intrinsics_path).items():
         values = {key: float(intrinsics[key][row]) for key in (*_INTRINSICS, *lens)}
         try:
             if name not in row_of_mount:
@@ -237,12 +260,30 @@ def _read_cameras(
     return calibrated, unusable
 
 
+def _rows_by_sensor(columns: Mapping[str, NDArrayAny], path: Path) -> dict[str, int]:
+    """Row of each sensor; one that stands there twice must say the same twice."""
+    rows: dict[str, int] = {}
+    for row, name in enumerate(columns["sensor_name"]):
+        if expected := name_problem(name):
+            raise CalibrationError(
+                f"{path}: row {row} has sensor_name {shown(name)}; expected {expected}."
+            )
+        first = rows.setdefault(name, row)
+        for key, values in columns.items():
+            if values[first] != values[row] and first != row:
+                raise CalibrationError(
+                    f"{path}: rows {first} and {row} are both {name} and contradict each other: "
+                    f"{key} is {values[first]} and {values[row]}. Remove the wrong one."
+                )
+    return rows
+
+
 def _mount(mounts: Mapping[str, Any], row: int, name: str, path: Path) -> SE3:
     return mount_from_quaternion(
-        [mounts[key][row] for key in _QUATERNION],
-        np.array([mounts[key][row] for key in _TRANSLATION], dtype=np.float64),
+        [float(mounts[key][row]) for key in _QUATERNION],
+        [float(mounts[key][row]) for key in _TRANSLATION],
         name,
-        str(path),
+        f"{path}, row {row},",
     )
 
 
@@ -270,11 +311,16 @@ def _list_images(folder: Path, warnings: list[str]) -> dict[str, list[tuple[int,
     """Time and path of every image, by camera; cameras without images are left out."""
     if not folder.is_dir():
         return {}
-    listed = {
-        camera.name: _timed_files(camera, _IMAGE_SUFFIXES, warnings)
-        for camera in sorted(folder.iterdir())
-        if camera.is_dir()
-    }
+    listed = {}
+    for camera in sorted(folder.iterdir()):
+        if not camera.is_dir():
+            continue
+        if expected := name_problem(camera.name):
+            warnings.append(
+                f"left out the camera folder {shown(camera.name)} in {folder}: expected {expected}"
+            )
+            continue
+        listed[camera.name] = _timed_files(camera, _IMAGE_SUFFIXES, warnings)
     return {name: files for name, files in listed.items() if files}
 
 
@@ -284,20 +330,26 @@ def _timed_files(
     """Files named by their time in nanoseconds; others are counted in a warning."""
     if not folder.is_dir():
         return []
-    timed, others = [], 0
+    timed: dict[int, Path] = {}
+    others, repeated = 0, []
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
         # isdecimal alone would let through digits of other scripts.
-        if path.stem.isascii() and path.stem.isdecimal():
-            timed.append((int(path.stem), path))
-        else:
+        if not (path.stem.isascii() and path.stem.isdecimal() and int(path.stem) < MAX_TIME_NS):
             others += 1
+        elif timed.setdefault(int(path.stem), path) is not path:
+            repeated.append(path)  # would count twice in the map
     if others:
         warnings.append(
             f"{others} files in {folder} are not named by a time in nanoseconds; they were left out"
         )
-    return timed
+    if repeated:
+        warnings.append(
+            f"{len(repeated)} files in {folder} have the time of another one and are left out, the "
+            f"first is {repeated[0].name}"
+        )
+    return sorted(timed.items())
 
 
 def _map_frame(maps: Sequence[Path], warnings: list[str]) -> MapFrame:

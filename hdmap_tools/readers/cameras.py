@@ -4,23 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
+import numpy as np
+
 from hdmap_tools.errors import CalibrationError, DriveError, ShapeError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
-from hdmap_tools.types import NDArrayFloat
+from hdmap_tools.readers.checks import MAX_MOUNT_M, numbers, shown
 
 
-def mount_from_quaternion(
-    wxyz: Sequence[float], xyz_m: NDArrayFloat, sensor: str, source: str
-) -> SE3:
-    """``ego_SE3_sensor``, or a `CalibrationError` that names the sensor and the file."""
+def mount_from_quaternion(wxyz: object, xyz_m: object, sensor: str, source: str) -> SE3:
+    """``ego_SE3_sensor`` from what a table holds.
+
+    Args:
+        wxyz: Should be 4 numbers, a quaternion, scalar first.
+        xyz_m: Should be 3 numbers, metres, at most `MAX_MOUNT_M`.
+        sensor: Names the sensor in messages.
+        source: Names the file and the row in messages.
+
+    Raises:
+        CalibrationError: If they are anything else; names the sensor and the source.
+    """
+
+    def unusable(reason: str) -> CalibrationError:
+        return CalibrationError(
+            f"Mount of {sensor} in {source} is unusable: {reason} Correct the calibration."
+        )
+
+    rotation, translation = numbers(wxyz, (4,)), numbers(xyz_m, (3,))
+    if rotation is None:
+        raise unusable(f"rotation is {shown(wxyz)}, expected 4 numbers (w, x, y, z).")
+    if translation is None:
+        raise unusable(f"translation is {shown(xyz_m)}, expected 3 numbers in metres.")
+    if not (np.abs(translation) <= MAX_MOUNT_M).all():
+        raise unusable(
+            f"translation is {shown(translation.tolist())}, expected finite metres within "
+            f"{MAX_MOUNT_M:g} m of the vehicle's origin."
+        )
     try:
-        qw, qx, qy, qz = (float(value) for value in wxyz)
-        return SE3.from_quaternion(qw, qx, qy, qz, xyz_m)
-    except (ShapeError, ValueError, TypeError) as error:
-        raise CalibrationError(
-            f"Mount of {sensor} in {source} is unusable: {error} Correct the calibration."
-        ) from error
+        qw, qx, qy, qz = rotation.tolist()
+        return SE3.from_quaternion(qw, qx, qy, qz, translation)
+    except ShapeError as error:
+        raise unusable(str(error)) from error
 
 
 def select_cameras(

@@ -13,6 +13,7 @@ from hdmap_tools.errors import DriveError, ShapeError, SweepError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.readers.checks import MAX_RANGE_M
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
 
 
@@ -132,12 +133,15 @@ class Drive:
         )
 
 
-def keep_finite(
-    points: NDArrayFloat, *columns: NDArrayByte
-) -> tuple[NDArrayFloat, list[NDArrayByte], int]:
-    """Drop rows with NaN or infinite coordinates; also says how many were dropped."""
-    finite = np.isfinite(points).all(axis=1)
-    return points[finite], [column[finite] for column in columns], int((~finite).sum())
+def keep_usable(values: NDArrayFloat) -> tuple[NDArrayFloat, int]:
+    """Rows (M, C) of points (N, C), x y z first, metres, and how many were dropped.
+
+    Dropped are rows with a value that is NaN or infinite, and points further from
+    the sensor than `MAX_RANGE_M`.
+    """
+    # NaN compares as False, infinity as too far.
+    usable = np.isfinite(values).all(axis=1) & (np.abs(values[:, :3]) <= MAX_RANGE_M).all(axis=1)
+    return values[usable], int((~usable).sum())
 
 
 def to_bytes(values: NDArrayAny, name: str, path: Path) -> NDArrayByte:

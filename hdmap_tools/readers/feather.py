@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hdmap_tools.errors import DriveError
+from hdmap_tools.readers.checks import shown_names
 from hdmap_tools.types import NDArrayAny
 
 
@@ -19,7 +20,7 @@ def read_columns(
 ) -> dict[str, NDArrayAny]:
     """Columns by name, each (N,), in the order required, then optional ones that exist.
 
-    Missing values become NaN in numeric columns.
+    Missing values become NaN in numeric columns, which makes whole numbers float64.
 
     Args:
         path: The file.
@@ -39,22 +40,36 @@ def read_columns(
     try:
         # No memory map: a file cut short while it is mapped would kill the process.
         table = pyarrow.feather.read_table(path, memory_map=False)
-    except (pa.ArrowException, OSError) as error:
+        # Offsets and lengths inside the file are not checked otherwise, and reading
+        # by wrong ones is reading memory that is not the table's.
+        table.validate(full=True)
+    except PermissionError as error:
+        raise error_type(f"{path} cannot be read: permission denied.") from error
+    except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise error_type(
             f"{path} is not a readable feather table ({path.stat().st_size} bytes: {reason}); it is "
             "truncated or of another format. Copy it again."
         ) from error
-    missing = [name for name in required if name not in table.column_names]
+    names = table.column_names
+    missing = [name for name in required if name not in names]
     if missing:
         raise error_type(
-            f"{path} lacks the columns {', '.join(missing)}; it has "
-            f"{', '.join(table.column_names) or 'none'}."
+            f"{path} lacks the columns {', '.join(missing)}; it has {shown_names(names)}."
         )
     columns: dict[str, NDArrayAny] = {}
-    for name in (*required, *(name for name in optional if name in table.column_names)):
-        values = np.asarray(table[name].to_numpy())
-        if name != "sensor_name" and not np.issubdtype(values.dtype, np.number):
+    for name in (*required, *(name for name in optional if name in names)):
+        if names.count(name) > 1:
+            raise error_type(f"{path} has {names.count(name)} columns called {name}; expected one.")
+        column = table[name]
+        if pa.types.is_dictionary(column.type):
+            column = column.cast(column.type.value_type)
+        values = np.asarray(column.to_numpy())
+        if name == "sensor_name":
+            if not all(isinstance(value, str) for value in values):
+                raise error_type(f"{path}: column {name} is {column.type}; expected names.")
+        # The kinds of whole and floating numbers; durations count as numbers elsewhere.
+        elif values.dtype.kind not in "iuf":
             raise error_type(f"{path}: column {name} is {values.dtype}; expected numbers.")
         columns[name] = values
     return columns

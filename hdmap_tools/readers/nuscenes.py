@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -30,15 +30,19 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
 from hdmap_tools.readers.cameras import mount_from_quaternion, select_cameras
-from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_finite, to_bytes
+from hdmap_tools.readers.checks import numbers, shown
+from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_usable, to_bytes
+from hdmap_tools.readers.folders import os_errors_are_drive_errors
 from hdmap_tools.readers.nuscenes_tables import (
     Row,
     by_token,
     choose_scene,
     choose_version_folder,
     read_table,
+    row_name,
 )
 from hdmap_tools.readers.poses import trajectory_from_table
+from hdmap_tools.types import NDArrayFloat
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +60,7 @@ _POINT_BYTES: Final = 5 * 4  # float32 x, y, z, intensity, ring
 _REFERENCE_KEYS: Final = ("map", "resolution_m", "origin_xy_m", "size_px")
 
 
+@os_errors_are_drive_errors()
 def read_nuscenes(
     root: Path,
     scene: str | None = None,
@@ -83,22 +88,29 @@ def read_nuscenes(
     folder = choose_version_folder(Path(root), version)
     data_root = folder.parent
     row = choose_scene(read_table(folder, "scene"), scene, folder)
-    log = _row_of(by_token(read_table(folder, "log")), row["log_token"], "log", folder)
-    samples = by_token(read_table(folder, "sample", lambda r: r["scene_token"] == row["token"]))
-    data = read_table(folder, "sample_data", lambda r: r["sample_token"] in samples)
+    warnings: list[str] = []
+
+    def rows_of(table: str, keep: Callable[[Row], bool] = lambda r: True) -> dict[str, Row]:
+        return by_token(read_table(folder, table, keep), table, folder, warnings)
+
+    log = _row_of(rows_of("log"), row["log_token"], "log", folder)
+    samples = rows_of("sample", lambda r: r["scene_token"] == row["token"])
+    data = list(rows_of("sample_data", lambda r: r["sample_token"] in samples).values())
     if not data:
         raise DriveError(
             f"Scene {row['name']} has no measurements: {folder / 'sample_data.json'} has no row for "
             f"its {len(samples)} samples. Unpack the metadata again."
         )
     pose_tokens = {r["ego_pose_token"] for r in data}
-    poses = by_token(read_table(folder, "ego_pose", lambda r: r["token"] in pose_tokens))
-    calibrations = by_token(read_table(folder, "calibrated_sensor"))
-    sensors = by_token(read_table(folder, "sensor"))
+    poses = rows_of("ego_pose", lambda r: r["token"] in pose_tokens)
+    calibrations = rows_of("calibrated_sensor")
+    sensors = rows_of("sensor")
 
-    warnings: list[str] = []
     trajectory = _trajectory(poses, folder, warnings)
-    channels = _by_channel(data, calibrations, sensors, folder)
+    channels = {
+        channel: (modality, _measured_once(channel, rows, warnings))
+        for channel, (modality, rows) in _by_channel(data, calibrations, sensors, folder).items()
+    }
     posed, unposed = _with_pose(channels, poses, folder)
     calibrated: dict[str, PinholeCamera] = {}
     unusable: dict[str, DriveError] = {}
@@ -183,13 +195,15 @@ def read_nuscenes_sweep(ref: SweepRef, ego_SE3_lidar: SE3) -> Sweep:
             "(float32 x, y, z, intensity, ring). It is truncated or of another format: copy it again."
         )
     values = np.frombuffer(raw, dtype="<f4").reshape(-1, 5).astype(np.float64)
-    values, _, num_dropped = keep_finite(values)
+    values, num_dropped = keep_usable(values)
     if not len(values):
         raise SweepError(
-            f"Sweep {ref.path}: all {num_dropped} points are NaN or infinite; copy it again."
+            f"Sweep {ref.path}: all {num_dropped} points are NaN or infinite, or beyond 10 km; copy it again."
         )
     if num_dropped:
-        logger.warning("%s: dropped %d points that are NaN or infinite", ref.path, num_dropped)
+        logger.warning(
+            "%s: dropped %d points that are NaN, infinite or beyond 10 km", ref.path, num_dropped
+        )
     return Sweep(
         timestamp_ns=ref.timestamp_ns,
         points_ego=ego_SE3_lidar.transform_from(values[:, :3]),
@@ -217,16 +231,25 @@ def _trajectory(poses: Mapping[str, Row], folder: Path, warnings: list[str]) -> 
     if not poses:
         raise PoseError(f"Table {path} has none of the poses that the scene refers to.")
     rows = sorted(poses.values(), key=lambda r: (int(r["timestamp"]), str(r["token"])))
-    try:
-        wxyz = np.array([r["rotation"] for r in rows], dtype=np.float64)
-        xyz_m = np.array([r["translation"] for r in rows], dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise PoseError(
-            f"Poses in {path} are unusable: expected 4 numbers of rotation and 3 of translation in "
-            f"each row ({error})."
-        ) from error
+
+    def column(name: str, what: str, count: int) -> NDArrayFloat:
+        values = []
+        for row in rows:
+            vector = numbers(row[name], (count,))
+            if vector is None:
+                raise PoseError(
+                    f"Poses in {path} are unusable: {name} is {shown(row[name])} in "
+                    f"{row_name(row)}; expected {what}."
+                )
+            values.append(vector)
+        return np.array(values)
+
+    wxyz = column("rotation", "4 numbers (w, x, y, z)", 4)
+    xyz_m = column("translation", "3 numbers in metres", 3)
     times = np.array([r["timestamp"] for r in rows], dtype=np.int64) * 1000
-    return trajectory_from_table(times, wxyz, xyz_m, path, warnings)
+    return trajectory_from_table(
+        times, wxyz, xyz_m, path, warnings, [row_name(row) for row in rows]
+    )
 
 
 def _by_channel(
@@ -244,6 +267,28 @@ def _by_channel(
         sensor = _row_of(sensors, calibration["sensor_token"], "sensor", folder)
         channels.setdefault(sensor["channel"], (sensor["modality"], []))[1].append(row)
     return channels
+
+
+def _measured_once(channel: str, rows: Sequence[Row], warnings: list[str]) -> list[Row]:
+    """Rows without those whose time or file an earlier row has: each would count twice in the map."""
+    times: set[int] = set()
+    files: set[str] = set()
+    once: list[Row] = []
+    repeated: list[Row] = []
+    for row in rows:
+        if row["timestamp"] in times or row["filename"] in files:
+            repeated.append(row)
+            continue
+        times.add(row["timestamp"])
+        files.add(row["filename"])
+        once.append(row)
+    if repeated:
+        warnings.append(
+            f"{len(repeated)} of {len(rows)} measurements of {channel} have the time or the file of "
+            f"an earlier one and are left out, the first is {row_name(repeated[0])} in "
+            f"sample_data.json ({repeated[0]['filename']})"
+        )
+    return once
 
 
 def _with_pose(
@@ -267,7 +312,7 @@ def _mount(channel: str, calibration: Row, folder: Path) -> SE3:
         calibration["rotation"],
         calibration["translation"],
         channel,
-        str(folder / "calibrated_sensor.json"),
+        f"{folder / 'calibrated_sensor.json'}, {row_name(calibration)},",
     )
 
 
@@ -284,15 +329,13 @@ def _camera(
         )
     calibration = calibrations[tokens.pop()]
     width, height = sizes.pop()
-    try:
-        matrix = np.array(calibration["camera_intrinsic"], dtype=np.float64)
-    except (ValueError, TypeError):
-        matrix = np.empty(0)
-    if matrix.shape != (3, 3):
+    matrix = numbers(calibration["camera_intrinsic"], (3, 3))
+    if matrix is None or not np.array_equal(matrix[2], (0.0, 0.0, 1.0)):
         raise CalibrationError(
             f"Camera {channel} has no usable camera_intrinsic in "
-            f"{folder / 'calibrated_sensor.json'}: found {calibration['camera_intrinsic']!r}, "
-            "expected a 3x3 matrix in pixels."
+            f"{folder / 'calibrated_sensor.json'}, {row_name(calibration)}: found "
+            f"{shown(calibration['camera_intrinsic'])}, expected a 3x3 matrix in pixels that ends "
+            "with the row (0, 0, 1)."
         )
     return PinholeCamera(
         name=channel,
@@ -325,7 +368,7 @@ def _reference_maps(root: Path, location: str, warnings: list[str]) -> tuple[Pat
             continue
         try:
             document: Any = json.loads(description.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             warnings.append(f"{description} is not readable JSON ({error}); its mask is left out")
             continue
         if (

@@ -10,6 +10,7 @@ from typing import Final
 from hdmap_tools.errors import DriveError
 from hdmap_tools.readers import av2, nuscenes
 from hdmap_tools.readers.drive import Drive
+from hdmap_tools.readers.folders import os_errors_are_drive_errors, require_listable
 from hdmap_tools.readers.nuscenes_tables import find_version_folders
 
 
@@ -46,7 +47,11 @@ def open_drive(
         DriveError: If the path does not exist, its layout is unknown or not clear,
             the scene does not exist, or the drive cannot be read.
     """
-    path = Path(path)
+    with os_errors_are_drive_errors():
+        return _open_drive(Path(path), layout, scene, cameras)
+
+
+def _open_drive(path: Path, layout: str, scene: str | None, cameras: Sequence[str]) -> Drive:
     if not path.exists():
         raise DriveError(f"{path} does not exist; expected the folder of a drive.")
     if not path.is_dir():
@@ -62,6 +67,7 @@ def open_drive(
         return fitting[0].read(path, scene, cameras)
     looked_for = "; ".join(f"{c.name}: {c.signature}" for c in LAYOUTS.values())
     if not fitting:
+        require_listable(path)
         content = "is empty" if not any(path.iterdir()) else "holds no known drive"
         raise DriveError(
             f"{path} {content}. Looked for {looked_for}. Give the drive's own folder, or its layout."
@@ -85,6 +91,7 @@ def _find_av2(path: Path) -> list[Path]:
 def _read_av2(path: Path, scene: str | None, cameras: Sequence[str]) -> Drive:
     logs = _find_av2(path)
     if not logs:
+        require_listable(path)
         raise DriveError(
             f"{path} holds no Argoverse 2 log: looked for {LAYOUTS[av2.LAYOUT].signature}."
         )

@@ -193,6 +193,11 @@ def test_matrix_is_opencvs() -> None:
         ({"cx": np.nan}, "must be finite"),
         ({"distortion": (0.1, 0.2, 0.0, 0.0)}, "five distortion coefficients"),
         ({"distortion": (0.1, 0.2, 0.0, 0.0, np.inf)}, "must be finite"),
+        ({"distortion": (0.1, 0.2, 0.0, 0.0, 1e308)}, "those of no camera"),
+        ({"distortion": (0.1, 0.2, 0.0, 0.0, -1e9)}, "those of no camera"),
+        ({"fx": 1e300}, "those of no camera"),
+        ({"cy": -1e7}, "those of no camera"),
+        ({"height_px": 10**30}, "those of no camera"),
     ],
 )
 def test_an_unusable_calibration_is_refused_with_the_cameras_name(change, message: str) -> None:
