@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from hdmap_tools.errors import LabelError
 from hdmap_tools.types import NDArrayByte
@@ -35,6 +35,17 @@ DRIVABLE_CLASSES: Final = (MapClass.ROAD, MapClass.CROSSWALK, MapClass.LANE_MARK
 """Where a vehicle may be: the ground between the road's boundaries."""
 
 
+_MAX_PROBLEMS: Final = 3
+_MAX_SHOWN: Final = 160
+
+
+def _printable(name: str) -> str:
+    if not name.isprintable():
+        raise ValueError("expected printable text, without control characters")
+    return name
+
+
+_Name = Annotated[str, AfterValidator(_printable)]
 _Channel = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -53,7 +64,7 @@ class Label(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: Annotated[int, Field(ge=0, le=254)]
-    name: Annotated[str, Field(min_length=1)]
+    name: Annotated[_Name, Field(min_length=1)]
     color: tuple[_Channel, _Channel, _Channel]
     map_class: MapClass | None = None
     moves: bool = False
@@ -70,7 +81,7 @@ class LabelSet(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str
+    name: _Name
     labels: tuple[Label, ...]
     source: str = ""
 
@@ -78,7 +89,8 @@ class LabelSet(BaseModel):
     def _ids_are_dense(self) -> LabelSet:
         ids = [label.id for label in self.labels]
         if ids != list(range(len(ids))) or not ids:
-            raise ValueError(f"label set {self.name!r} needs ids 0..n-1 in order, found {ids}")
+            found = ids if len(ids) <= 10 else f"{ids[:10]} and {len(ids) - 10} more"
+            raise ValueError(f"label set {self.name!r} needs ids 0..n-1 in order, found {found}")
         names = [label.name for label in self.labels]
         if len(set(names)) != len(names):
             raise ValueError(f"label set {self.name!r} has a name twice")
@@ -163,11 +175,44 @@ def load_label_set(name_or_path: str | Path) -> LabelSet:
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
     path = Path(name_or_path)
-    if not path.is_file():
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError):  # too long for a path, or a NUL in it
+        is_file = False
+    if not is_file:
         raise LabelError(
-            f"{str(name_or_path)!r} is neither a label set ({', '.join(sorted(shipped))}) nor a JSON file."
+            f"{_shown(str(name_or_path))} is neither a label set ({', '.join(sorted(shipped))}) nor "
+            "a JSON file."
         )
     try:
         return LabelSet.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, json.JSONDecodeError, UnicodeDecodeError, ValidationError) as error:
-        raise LabelError(f"{path} is not a label set: {error}") from error
+    except ValidationError as error:
+        reason = _problems(error)
+    except RecursionError:
+        reason = "it is nested too deeply"
+    except OSError as error:
+        reason = f"it cannot be read: {error.strerror or type(error).__name__}"
+    except ValueError as error:  # no JSON, no UTF-8, or a number of thousands of digits
+        reason = f"it is not valid JSON ({error})"
+    raise LabelError(f"{path} is not a label set: {reason}.")
+
+
+def _problems(error: ValidationError) -> str:
+    """At most three problems on one line, each with its field."""
+    details = error.errors(include_url=False, include_context=False, include_input=False)
+    lines = []
+    for detail in details[:_MAX_PROBLEMS]:
+        field_name = ".".join(str(part) for part in detail["loc"])
+        text = f"{field_name or 'the file'}: {detail['msg'].removeprefix('Value error, ')}"
+        lines.append(text if text.isprintable() and len(text) <= _MAX_SHOWN else _shown(text))
+    if num_more := len(details) - len(lines):
+        lines.append(f"and {num_more} more")
+    return "; ".join(lines)
+
+
+def _shown(text: str) -> str:
+    """For a message: quoted, on one line, and not long."""
+    quoted = ascii(text)
+    return (
+        quoted if len(quoted) <= _MAX_SHOWN else f"{quoted[:_MAX_SHOWN]}… ({len(text)} characters)"
+    )

@@ -150,12 +150,49 @@ def test_no_such_set_lists_the_shipped_ones(tmp_path: Path) -> None:
         load_label_set(tmp_path)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null"])
-def test_a_damaged_file_is_refused(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "it is not valid JSON"),
+        (b"{", "it is not valid JSON"),
+        (b"\xff\xfe", "it is not valid JSON"),
+        (b"[]", "the file: Input should be"),
+        (b"null", "the file: Input should be"),
+        (b"[" * 100_000, "it is nested too deeply"),
+        (b'{"name": ' + b"1" * 5000 + b"}", "it is not valid JSON"),
+        (b'{"name": "a", "labels": [{"id": ' + b"1" * 4000 + b"}]}", "labels.0.id: "),
+        (b'{"name": "\\ud800", "labels": []}', "name: expected printable text"),
+        (b'{"\\n\\u0000": 1, "name": "a", "labels": []}', r"\\n\\x00"),
+        (b'{"' + b"k" * 5000 + b'": 1}', r"\(50\d\d characters\)"),
+        (b'{"name": "' + b"n" * 5000 + b'", "labels": []}', r"\(50\d\d characters\)"),
+        (b'{"name": "a", "labels": [' + b"{}," * 300 + b"{}]}", "; and 900 more"),
+        (
+            json.dumps({"name": "a", "labels": labels(*map(str, range(99)))[1:]}).encode(),
+            "and 88 more",
+        ),
+    ],
+)
+def test_a_damaged_file_is_refused_on_one_short_line(
+    content: bytes, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "broken.json"
     path.write_bytes(content)
-    with pytest.raises(LabelError, match="is not a label set"):
+    with pytest.raises(
+        LabelError, match=rf"broken\.json is not a label set: .*{message}"
+    ) as caught:
         load_label_set(path)
+    text = str(caught.value)
+    assert text.isprintable()
+    assert len(text.replace(str(path), "")) < 600
+    assert "pydantic" not in text
+
+
+@pytest.mark.parametrize("name", ["a" * 5000, "a\0b", "\ud800"])
+def test_a_name_that_can_be_no_path_is_refused(name: str) -> None:
+    with pytest.raises(LabelError, match="is neither a label set") as caught:
+        load_label_set(name)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 400
 
 
 def test_each_shipped_file_is_named_as_its_set() -> None:
