@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hdmap_tools.compare.mask_file import load_mask
 from hdmap_tools.errors import FormatError
-from hdmap_tools.formats.by_name import read_vector_map
+from hdmap_tools.formats.by_name import is_readable, read_vector_map
 from hdmap_tools.fusion.cell_counts import TILE_CELLS
 from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
 from hdmap_tools.readers.open_drive import open_drive
@@ -17,16 +19,21 @@ from hdmap_tools.readers.open_drive import open_drive
 def describe(
     path: Path, layout: str = "auto", scene: str | None = None, cameras: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Facts about a drive, a semantic map (or the folder of a run), or a vector map.
+    """Facts about a drive, a semantic map (or the folder of a run), a vector map, or a mask.
 
     Raises:
         HDMapError: If it is none of these, or cannot be read.
     """
     if not path.exists():
         raise FormatError(
-            f"{path} does not exist; expected a drive, a semantic map or a vector map."
+            f"{path} does not exist; expected a drive, a semantic map, a vector map or a mask."
         )
     if path.is_file():
+        suffix = path.suffix.lower()
+        if suffix == ".png":
+            return _describe_mask(path)
+        if suffix == ".json":
+            _refuse_figures(path)
         return _describe_vector_map(path)
     if is_semantic_map(path):
         return _describe_semantic_map(path)
@@ -54,7 +61,10 @@ def _describe_drive(
             name: f"{camera.width_px} x {camera.height_px}, {images[name]} images"
             for name, camera in sorted(drive.cameras.items())
         },
-        "reference_maps": [str(p) for p in drive.reference_maps],
+        "reference_maps": [
+            {"path": str(p), "is_readable": p.suffix.lower() == ".png" or is_readable(p)}
+            for p in drive.reference_maps
+        ],
         "warnings": list(drive.warnings),
     }
 
@@ -86,6 +96,38 @@ def _describe_vector_map(path: Path) -> dict[str, Any]:
         "kind": "vector map",
         "place": vector_map.frame.describe(),
         "elements": vector_map.counts(),
-        "bounds_m": [round(b, 2) for b in vector_map.bounds_m or ()],
+        "bounds_m": _bounds(vector_map.bounds_m),
         "provenance": vector_map.provenance,
     }
+
+
+def _describe_mask(path: Path) -> dict[str, Any]:
+    mask = load_mask(path)
+    width, height = mask.sidecar.size_px
+    return {
+        "kind": "mask",
+        "place": mask.frame.describe(),
+        "classes": ", ".join(mask.sidecar.classes),
+        "resolution_m": mask.sidecar.resolution_m,
+        "size": f"{width} x {height} pixels",
+        "marked": f"{mask.is_marked.mean():.1%}",
+        "bounds_m": _bounds(mask.bounds_m),
+    }
+
+
+def _bounds(bounds_m: Sequence[float] | None) -> dict[str, float]:
+    names = ("west", "south", "east", "north")
+    return {name: round(b, 2) for name, b in zip(names, bounds_m or (), strict=False)}
+
+
+def _refuse_figures(path: Path) -> None:
+    """A run's metrics.json lies beside its maps, and is none."""
+    try:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return  # the reader says what is wrong with it
+    if isinstance(document, dict) and {"num_elements", "comparisons"} <= document.keys():
+        raise FormatError(
+            f"{path} holds the figures of a run, not a map; open it as it is, or ask for info on its "
+            f"folder {path.parent}."
+        )

@@ -37,7 +37,7 @@ def read_vector_map(path: str | os.PathLike[str], frame: MapFrame | None = None)
         found = "is a folder" if path.is_dir() else "does not exist"
         raise FormatError(f"{path} {found}; expected a map file ({_suffixes()}).")
     name = _NAME_OF_SUFFIX.get(path.suffix.lower())
-    if path.suffix.lower() == ".json" and path.name.startswith("log_map_archive_"):
+    if _is_av2_map(path):
         raise FormatError(
             f"{path} is an Argoverse 2 map, which cannot be read yet; expected {_suffixes()}."
         )
@@ -58,6 +58,15 @@ def read_vector_map(path: str | os.PathLike[str], frame: MapFrame | None = None)
     raise FormatError(
         f"{path} has the suffix {path.suffix!r}, which is no map format known; expected {_suffixes()}."
     )
+
+
+def is_readable(path: Path) -> bool:
+    """Whether `read_vector_map` knows files of that name."""
+    return path.suffix.lower() in _NAME_OF_SUFFIX and not _is_av2_map(path)
+
+
+def _is_av2_map(path: Path) -> bool:
+    return path.suffix.lower() == ".json" and path.name.startswith("log_map_archive_")
 
 
 def write_vector_map(

@@ -129,8 +129,8 @@ def read_geojson(path: str | os.PathLike[str], frame: MapFrame | None = None) ->
         element_from_fields(t, properties, map_geometry(g, frame.from_wgs84), name)
         for t, properties, g, name in found
     ]
+    skipped.log(_log, source)
     if skipped.counts:
-        _log.warning("%s: skipped %s.", source, skipped.describe())
         provenance = {**provenance, **skipped.to_provenance()}
     return VectorMap(frame, with_stable_ids(elements), provenance)
 

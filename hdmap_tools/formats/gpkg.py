@@ -119,8 +119,8 @@ def read_gpkg(path: str | os.PathLike[str]) -> VectorMap:
                         f"{source}, layer {name}, feature {fid}",
                     )
                 )
+    skipped.log(_log, source)
     if skipped.counts:
-        _log.warning("%s: skipped %s.", source, skipped.describe())
         provenance = {**provenance, **skipped.to_provenance()}
     return VectorMap(frame or MapFrame(), with_stable_ids(elements), provenance)
 

@@ -70,8 +70,7 @@ def read_lanelet2(path: str | os.PathLike[str], frame: MapFrame | None = None) -
     reader = _Reader(document, frame)
     reader.read()
     skipped, read_as = reader.skipped, +reader.read_as
-    if skipped.counts:
-        _log.warning("%s: skipped %s.", path, skipped.describe())
+    skipped.log(_log, str(path))
     if read_as:
         _log.info("%s: read %s.", path, ", ".join(f"{n} {k}" for k, n in sorted(read_as.items())))
     kept = {k: v for k, v in provenance.items() if k not in ("skipped", "skipped_ids", "read_as")}

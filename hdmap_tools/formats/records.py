@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
@@ -22,6 +24,9 @@ METADATA_VERSION: Final = 1
 
 MAX_LISTED_IDS: Final = 20
 """How many ids of skipped things are kept beside their count."""
+
+MAX_LISTED_CHARACTERS: Final = 120
+"""Of the kinds of skipped things in a warning."""
 
 
 class Skipped:
@@ -45,12 +50,35 @@ class Skipped:
             found["skipped_ids"] = dict(sorted(self.ids.items()))
         return found
 
+    def log(self, logger: logging.Logger, source: str) -> None:
+        """Warn of it in one short line, if there is anything; all of it is for who asks."""
+        if self.counts:
+            logger.warning(
+                "%s: skipped %s (-v or info --json lists them).",
+                source,
+                brief_counts(self.counts, MAX_LISTED_CHARACTERS),
+            )
+            logger.info("%s: skipped %s.", source, self.describe())
+
     def describe(self) -> str:
         """One line: ``3 way:arrow (ids 7, 8, 9), ...``."""
         return ", ".join(
             f"{count} {kind} ({', '.join(self.ids[kind][:3])}{', ...' if count > 3 else ''})"
             for kind, count in sorted(self.counts.items())
         )
+
+
+def brief_counts(counts: Mapping[str, int], max_characters: int) -> str:
+    """Counts by the first part of their kind, largest first: ``38 way, 19 node, ...``."""
+    groups: Counter[str] = Counter()
+    for kind, count in counts.items():
+        groups[kind.partition(":")[0]] += count
+    parts = [f"{n} {kind}" for kind, n in sorted(groups.items(), key=lambda g: (-g[1], g[0]))]
+    text = ", ".join(parts)
+    while len(text) > max_characters and len(parts) > 1:
+        parts.pop()
+        text = ", ".join([*parts, "..."])
+    return text
 
 
 def map_geometry(
