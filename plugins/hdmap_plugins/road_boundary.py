@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy import ndimage
 from shapely.geometry import LineString
 
 from hdmap_plugins.contours import Contour, contours, edge_sigma_cells, edge_slope
+from hdmap_plugins.fragments import lengths_with_company
 from hdmap_plugins.lines import MIN_STEP_M, kept_by_simplification, smooth
 from hdmap_plugins.sampling import (
     bilinear,
@@ -20,7 +22,7 @@ from hdmap_plugins.sampling import (
     to_city,
     votes_at,
 )
-from hdmap_tools.geometry.polyline import arc_lengths, drop_repeats, normals, resample
+from hdmap_tools.geometry.polyline import drop_repeats, normals, resample
 from hdmap_tools.plugin_api import (
     DRIVABLE_CLASSES,
     BoundaryKind,
@@ -47,7 +49,11 @@ class RoadBoundaryOptions(VectorizerOptions):
         threshold: Probability of road, crosswalk or lane mark on the outline.
         min_road_area_m2: Smaller drivable patches are dropped as specks.
         min_island_area_m2: Smaller islands in the road are dropped as specks.
-        min_length_m: Shorter open lines are dropped.
+        min_length_m: Shorter open lines are dropped, unless others go on with them:
+            pieces of one boundary, with gaps no longer than they are, count together.
+            Heights and smoothing need about as much line to say anything.
+        min_confidence: Lines that are less sure are dropped: as likely as not, the road
+            does not end there.
         fill_gap_m: Unknown stripes (between lidar rings) up to this wide are filled;
             wider ones end the boundary, for nothing is known of it there.
         tolerance_m: The line stays this near to the outline: 0.7 of it for smoothing
@@ -63,7 +69,8 @@ class RoadBoundaryOptions(VectorizerOptions):
     threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     min_road_area_m2: Annotated[float, Field(ge=0.0)] = 4.0
     min_island_area_m2: Annotated[float, Field(ge=0.0)] = 1.0
-    min_length_m: Annotated[float, Field(ge=0.0)] = 1.0
+    min_length_m: Annotated[float, Field(ge=0.0)] = 2.0
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
     fill_gap_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.3
     tolerance_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.1
     smooth_wavelength_m: Annotated[float, Field(ge=0.0, le=20.0)] = 1.5
@@ -79,6 +86,11 @@ class RoadBoundaryOutline(Vectorizer):
     Only known cells are traced: where the road meets what nobody saw, or the edge
     of the window, there is no line, because that is not where the road ends. Rings
     around areas that are not drivable are islands.
+
+    The confidence is the mean along the line of the probability that one side is road
+    and the other is not, each looked at where the blur of the edge has ended, or as far
+    away as anything is known. (Where the edge lies within the blur
+    is not its question, but that of ``sigma_m``.)
     """
 
     name = "road_boundary"
@@ -101,22 +113,27 @@ class RoadBoundaryOutline(Vectorizer):
         has_height = np.isfinite(window.layer("height"))
 
         slope = edge_slope(drivable)
-        result: list[MapElement] = []
+        outlines = []
         for contour in contours(field, options.threshold, close_at_edge=False):
-            length_m = float(arc_lengths(contour.xy_cells)[-1]) * resolution
             area_m2 = contour.signed_area_cells * resolution**2 if contour.is_closed else 0.0
             least = options.min_island_area_m2 if area_m2 > 0.0 else options.min_road_area_m2
             # A ring can be small though what it parts from the rest is not: where
             # areas touch at corners only.
             if contour.is_closed and abs(area_m2) < least:
                 continue
-            if not contour.is_closed and length_m < max(options.min_length_m, resolution):
-                continue
             xy = _smoothed(contour, options, resolution)
+            sigma_cells = edge_sigma_cells(slope, contour.xy_cells)
+            confidence = _confidence(field, xy, sigma_cells, resolution)
+            if confidence >= options.min_confidence:
+                outlines.append(_Outline(xy, contour.is_closed, area_m2, sigma_cells, confidence))
+
+        result: list[MapElement] = []
+        for outline in _long_enough(outlines, options, resolution):
+            xy = outline.xy_cells
             kept = kept_by_simplification(
                 xy,
                 (1.0 - _SMOOTHING_SHARE) * options.tolerance_m / resolution,
-                is_closed=contour.is_closed,
+                is_closed=outline.is_closed,
             )
             # The road is on the right, against the normal.
             to_road = -normals(xy)
@@ -124,23 +141,75 @@ class RoadBoundaryOutline(Vectorizer):
             far_side = xy - to_road * max(0.3 / resolution, 1.0)
             z = heights_along(surface, road_side, round(2.0 / resolution / _STATION_CELLS))
             xyz = np.column_stack([to_city(xy[kept], window.grid), z[kept]])
-            geometry = LineString(drop_repeats(xyz, MIN_STEP_M))
-            if len(xyz) < 2 or not geometry.is_valid:
+            vertices = drop_repeats(xyz, MIN_STEP_M)
+            if len(vertices) < 2 or not (geometry := LineString(vertices)).is_valid:
                 continue
-            support = bilinear(drivable, xy + to_road) * (1.0 - bilinear(drivable, xy - to_road))
             result.append(
                 RoadBoundary(
                     geometry=geometry,
                     kind=_kind(surface, has_height, xy, to_road, options, resolution),
-                    is_island=area_m2 > 0.0,
-                    confidence=float(np.clip(np.mean(support), 0.0, 1.0)),
-                    sigma_m=edge_sigma_cells(slope, contour.xy_cells) * resolution,
+                    is_island=outline.area_m2 > 0.0,
+                    confidence=outline.confidence,
+                    sigma_m=outline.sigma_cells * resolution,
                     num_observations=votes_at(
                         window.layer("observations"), np.vstack([road_side, far_side])
                     ),
                 )
             )
         return result
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """A smoothed contour in cells, the road on its right; its area is positive for an island."""
+
+    xy_cells: NDArrayFloat
+    is_closed: bool
+    area_m2: float
+    sigma_cells: float
+    confidence: float
+
+
+def _confidence(
+    field: NDArrayFloat, xy: NDArrayFloat, sigma_cells: float, resolution: float
+) -> float:
+    """Mean probability that there is road on the right of a line and none on its left.
+
+    Args:
+        field: (y, x) probability of road, NaN where unknown.
+        xy: (N, 2) stations, cells.
+        sigma_cells: Blur of the edge; beyond two sigmas it does not reach.
+        resolution: Metres a cell.
+    """
+    # Half a metre away there may be something else already: the far side of an island.
+    farthest = min(max(2.0 * sigma_cells, 1.0), max(0.5 / resolution, 1.0))
+    is_known = np.isfinite(field)
+    known_share = is_known.astype(np.float64)
+    known_road = np.where(is_known, field, 0.0)
+    sides = []
+    for direction in (-normals(xy), normals(xy)):
+        side = np.full(len(xy), 0.5)
+        # Nearer to the line where nothing was seen as far away; beside it something was.
+        for reach in (0.5, 1.0, farthest):
+            places = xy + reach * direction
+            share = bilinear(known_share, places)
+            is_seen = share > 0.7
+            side[is_seen] = bilinear(known_road, places)[is_seen] / share[is_seen]
+        sides.append(side)
+    return float(np.clip(np.mean(sides[0] * (1.0 - sides[1])), 0.0, 1.0))
+
+
+def _long_enough(
+    outlines: list[_Outline], options: RoadBoundaryOptions, resolution: float
+) -> list[_Outline]:
+    """Rings, and open lines that are long enough alone or with those that go on with them."""
+    is_open = [index for index, outline in enumerate(outlines) if not outline.is_closed]
+    lengths = lengths_with_company(
+        [outlines[index].xy_cells for index in is_open], 1.0 / resolution
+    )
+    least = max(options.min_length_m / resolution, 1.0)
+    dropped = {index for index, length in zip(is_open, lengths, strict=True) if length < least}
+    return [outline for index, outline in enumerate(outlines) if index not in dropped]
 
 
 def _without_specks(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import shapely
+from scipy import ndimage
 from shapely import affinity
 from shapely.geometry import Point, Polygon, box
 
@@ -145,6 +146,71 @@ def test_specks_are_dropped():
     assert all(b.geometry.length == pytest.approx(19.8, abs=0.1) for b in found)
 
 
+def test_a_short_piece_needs_company():
+    road = box(-5, 4.05, 40, 11.05)
+    # Of the north edge a short piece is seen by itself, and 7 m in six short pieces.
+    seen = [(2.0, 3.4), *((10 + 1.8 * k, 11.2 + 1.8 * k) for k in range(6))]
+    unknown = box(0, 9, 30, 15).difference(shapely.union_all([box(a, 9, b, 15) for a, b in seen]))
+    window = scene(road, (0, 0, 30, 15), 0.1, unknown=unknown)
+
+    def north_edge(**options):
+        ends = [
+            b.geometry.bounds for b in boundaries(window, **options) if b.geometry.bounds[1] > 9
+        ]
+        return sorted((x0, x1) for x0, _, x1, _ in ends)
+
+    np.testing.assert_allclose(north_edge(), seen[1:], atol=0.11)
+    np.testing.assert_allclose(north_edge(min_length_m=1.0), seen, atol=0.11)
+    assert north_edge(min_length_m=8.0) == []
+    assert len(boundaries(window, min_length_m=8.0)) == 1
+
+
+@pytest.mark.parametrize("resolution_m", RESOLUTIONS)
+def test_a_doubtful_boundary_is_dropped(resolution_m):
+    """Road that the map holds for 0.55 beside 0.45: the threshold runs through noise there."""
+    window = scene(box(-5, 4, 40, 11), (0, 0, 30, 15), resolution_m)
+    posterior = window.dataset["posterior"].values.copy()
+    x, y = np.meshgrid(window.grid.x_centres_m, window.grid.y_centres_m)
+    doubtful = (np.abs(x - 15) < 4) & (np.abs(y - 7.5) < 2)
+    posterior[:, doubtful] = np.array([0.45, 0, 0, 0, 0.55])[:, None]
+    around = (np.abs(x - 15) < 5) & (np.abs(y - 7.5) < 3) & ~doubtful
+    posterior[:, around] = np.array([0.55, 0, 0, 0, 0.45])[:, None]
+    window = window_from_posterior(posterior, window.grid)
+    assert [b.is_island for b in boundaries(window)] == [False] * 2
+    everything = boundaries(window, min_confidence=0.0)
+    (island,) = [b for b in everything if b.is_island]
+    assert len(everything) == 3
+    assert island.confidence == pytest.approx(0.55 * 0.55, abs=0.02)
+
+
+def test_confidence_is_of_the_sides_and_sigma_of_the_place():
+    """That an edge is blurred makes its place less sure, not that there is one."""
+    window = scene(box(-5, 4.05, 40, 11.05), (0, 0, 30, 8), 0.1)
+    (sharp,) = boundaries(window)
+    for blur_m in (0.1, 0.2):
+        posterior = ndimage.gaussian_filter(
+            window.dataset["posterior"].values, (0, blur_m / 0.1, blur_m / 0.1), mode="nearest"
+        )
+        (found,) = boundaries(window_from_posterior(posterior.astype(np.float32), window.grid))
+        assert found.confidence == pytest.approx(sharp.confidence, abs=0.05)
+        assert found.sigma_m == pytest.approx(np.hypot(blur_m, sharp.sigma_m), rel=0.1)
+
+
+@pytest.mark.parametrize("seen_cells", [1, 2, 4])
+def test_what_is_unknown_says_nothing_about_the_edge(seen_cells):
+    """Neither that the road ends there, nor that it does not."""
+    window = scene(box(-5, 4.0, 40, 11.0), (0, 0, 30, 8), 0.1)
+    posterior = window.dataset["posterior"].values.copy()
+    row = 40
+    posterior[:, :row] = np.array([0.3, 0, 0, 0, 0.7])[:, None, None]
+    (sure,) = boundaries(window_from_posterior(posterior, window.grid))
+    assert sure.confidence == pytest.approx(0.95 * 0.7, abs=0.03)
+    posterior[:, : row - seen_cells] = np.nan
+    (hidden,) = boundaries(window_from_posterior(posterior, window.grid))
+    assert hidden.confidence == pytest.approx(sure.confidence, abs=0.03)
+    assert hidden.geometry.length == pytest.approx(sure.geometry.length)
+
+
 def kerb_scene(step_m: float, hide: str = "") -> MapWindow:
     window = scene(box(-5, 4.05, 40, 11.05), (0, 0, 20, 8), 0.1)
     x, y = np.meshgrid(window.grid.x_centres_m, window.grid.y_centres_m)
@@ -215,7 +281,9 @@ def test_tiny_grids(shape):
         posterior = rng.dirichlet(np.full(5, 0.3), shape).transpose(2, 0, 1).astype(np.float32)
         posterior[:, rng.random(shape) < 0.2] = np.nan
         window = window_from_posterior(posterior, BevGrid(0.2, 3, 4, 3 + cols, 4 + rows))
-        none_dropped = {"min_road_area_m2": 0.0, "min_island_area_m2": 0.0, "min_length_m": 0.0}
+        none_dropped = dict.fromkeys(
+            ("min_road_area_m2", "min_island_area_m2", "min_length_m", "min_confidence"), 0.0
+        )
         for boundary in boundaries(window, **none_dropped):
             assert boundary.geometry.length > 0
 
