@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import re
 import sys
 from typing import Any, Final
 
@@ -44,17 +45,56 @@ class _LazyGroup(click.Group):
             return None
         module = importlib.import_module(f"hdmap_tools.cli.{cmd_name}")
         command: click.Command = module.command
-        return command
+        return _with_verbosity(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(list(_COMMANDS.items()))
 
 
+def _with_verbosity(command: click.Command) -> click.Command:
+    """The command, taking -v and -q too: people add them to the end of the line that failed."""
+    for sub_command in command.commands.values() if isinstance(command, click.Group) else ():
+        _with_verbosity(sub_command)
+    if not any("--verbose" in parameter.opts for parameter in command.params):
+        # Not in each command's help: `hdmap --help` says it once.
+        command.params += [
+            click.Option(
+                ["-v", "--verbose"], count=True, hidden=True, expose_value=False, callback=_set_more
+            ),
+            click.Option(
+                ["-q", "--quiet"],
+                is_flag=True,
+                hidden=True,
+                expose_value=False,
+                callback=_set_quiet,
+            ),
+        ]
+    return command
+
+
+def _set_more(ctx: click.Context, _: click.Parameter, count: int) -> None:
+    if count:
+        ctx.obj["verbose"] += count
+        _set_level(ctx.obj)
+
+
+def _set_quiet(ctx: click.Context, _: click.Parameter, is_quiet: bool) -> None:
+    if is_quiet:
+        ctx.obj["progress"] = False
+        _set_level(ctx.obj)
+
+
+def _set_level(said: dict[str, Any]) -> None:
+    levels = (logging.WARNING, logging.INFO, logging.DEBUG)
+    level = levels[min(said["verbose"], 2)] if said["progress"] else logging.ERROR
+    logging.getLogger("hdmap_tools").setLevel(level)
+
+
 @click.group(
     cls=_LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Each command has its own --help, which starts with examples.",
+    epilog="Each command has its own --help, which starts with examples, and takes -v and -q too.",
 )
 @click.version_option(__version__, prog_name="hdmap")
 @click.option("-v", "--verbose", count=True, help="Say more; -vv shows the traceback of an error.")
@@ -68,16 +108,11 @@ def hdmap(ctx: click.Context, verbose: int, quiet: bool) -> None:
       hdmap run path/to/drive -o out
       hdmap plugins list
     """
-    ctx.ensure_object(dict)
-    ctx.obj["progress"] = not quiet
-    level = (
-        logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    )
+    ctx.obj = {"progress": not quiet, "verbose": verbose}
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
-    logger = logging.getLogger("hdmap_tools")
-    logger.handlers[:] = [handler]
-    logger.setLevel(level)
+    logging.getLogger("hdmap_tools").handlers[:] = [handler]
+    _set_level(ctx.obj)
 
 
 def main(args: list[str] | None = None) -> None:
@@ -114,13 +149,13 @@ def main(args: list[str] | None = None) -> None:
 
 
 def _wants_traceback(arguments: list[str]) -> bool:
-    """Whether -vv was given: before the command, where click takes it."""
+    """Whether -vv, or -v twice, was given, before or after the command."""
     count = 0
     for argument in arguments:
-        if not argument.startswith("-"):
+        if argument == "--":
             break
         if argument == "--verbose":
             count += 1
-        elif not argument.startswith("--"):
+        elif re.fullmatch("-[qv]+", argument):
             count += argument.count("v")
     return count >= 2
