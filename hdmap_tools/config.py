@@ -66,17 +66,21 @@ class AssociationConfig(_Step):
             points, ``planar`` looks each cell up on a plane (no lidar needed).
         also: Methods that `hdmap run` builds in memory beside it, to compare with;
             those that need lidar are left out where there is none.
-        max_range_m: Points further from the ego origin (in x-y) are not used.
+        min_range_m: Ground nearer to the camera (in x-y) is not used: there the image
+            shows bonnet or boot, and what is labelled on them is not ground.
+        max_range_m: ``sparse``: points further from the ego origin (in x-y) are not used.
         ground_tolerance_m: How far above or below the estimated ground a point still is
             ground. At 0.2 m the feet of barriers and the fronts of kerbs come in, which
             cost 1.6 points of IoU on a recorded keyframe.
-        occlusion_test: Leave out points that nearer things hide from the camera.
+        occlusion_test: Leave out ground that nearer things hide from the camera
+            (``planar`` cannot: it knows of no things).
         lookup_range_m: Reach of ``surface`` and ``planar`` from the camera; a pixel
             covers more and more ground beyond it.
     """
 
     method: Literal["surface", "sparse", "planar"] = "surface"
     also: tuple[Literal["surface", "sparse", "planar"], ...] = ("sparse", "planar")
+    min_range_m: Annotated[float, Field(ge=0)] = 4.0
     max_range_m: Annotated[float, Field(gt=0)] = 40.0
     ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.1
     occlusion_test: bool = True
@@ -94,13 +98,21 @@ class FusionConfig(_Step):
             a point).
         intensity_threshold: k, the intensity 0..255 from which on a return looks
             like paint; ``auto`` estimates it by Otsu's method on road points.
-        reference_height_m: City height that stored heights count from.
+        reference_height_m: City height that stored heights count from, in whole millimetres.
     """
 
-    resolution_m: Annotated[float, Field(gt=0)] = 0.1
+    resolution_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     count_mode: Literal["majority", "share", "frame", "point"] = "share"
     intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
     reference_height_m: float = 0.0
+
+    @field_validator("reference_height_m")
+    @classmethod
+    def _is_whole_millimetres(cls, value: float) -> float:
+        # Otherwise changing the reference of a merged map would not be exact.
+        if abs(value * 1000 - round(value * 1000)) > 1e-6:
+            raise ValueError("must be a whole number of millimetres")
+        return value
 
 
 class ObservationConfig(_Step):
@@ -108,10 +120,13 @@ class ObservationConfig(_Step):
 
     Attributes:
         model: ``vanilla`` believes each label alike; ``confusion`` uses the
-            network's confusion matrix.
+            network's confusion matrix; ``auto`` does where one is known.
         confusion: Path of a confusion matrix, or None for the one known for the model.
         other: Let cells also be none of the map's classes (buildings, vehicles). The
             paper does without; then such cells go to the class least unlikely.
+        other_prior: Prior probability of that. A network that has one label for all
+            that is not road cannot tell a lawn from a building; without evidence
+            between them, "none of these" is what is claimed.
         intensity: Add the intensity term for lane marks.
         gamma: Weight of an intensity at or above k, as evidence for lane mark (log-likelihood).
         vanilla_lambda: λ in M = μ(I + λ1).
@@ -122,9 +137,10 @@ class ObservationConfig(_Step):
         fill_radius_cells: Radius of hole filling; 0 turns it off.
     """
 
-    model: Literal["vanilla", "confusion"] = "confusion"
+    model: Literal["auto", "vanilla", "confusion"] = "auto"
     confusion: Path | None = None
     other: bool = True
+    other_prior: Annotated[float, Field(ge=0, lt=1)] = 0.5
     intensity: bool = False
     gamma: Annotated[float, Field(ge=0)] = 2.0
     vanilla_lambda: Annotated[float, Field(gt=0)] = 0.1
@@ -236,7 +252,7 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
         if found != SCHEMA_VERSION:
             raise ConfigError(
                 f"{path} has schema_version {_short(found)}; this version reads {SCHEMA_VERSION}. "
-                "Install the matching release, or write the file anew with `hdmap info --config`."
+                "Install the matching release, or write the file anew with `hdmap info --default-config`."
             )
     for dotted, value in (overrides or {}).items():
         if value is None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hdmap_tools.config import Config
-from hdmap_tools.output_folder import MARKER, output_folder
+from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
 from hdmap_tools.segmentation.label_png import write_label_png
@@ -35,7 +35,7 @@ def write_label_folder(
     """
     pixels = np.zeros(256, dtype=np.int64)
     start = time.perf_counter()
-    with output_folder(out, overwrite) as folder:
+    with result_folder(out, "segment", overwrite) as folder:
         for image, labels in segment_drive(drive, segmenter, drive.images, cache, progress):
             path = folder / f"{image.key}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def write_label_folder(
         (folder / LABEL_SET_NAME).write_text(document, encoding="utf-8")
         made_by = json.dumps({"model": segmenter.name}, indent=2) + "\n"
         (folder / MODEL_NAME).write_text(made_by, encoding="utf-8")
-        (folder / MARKER).write_text(config.to_yaml(), encoding="utf-8")
+        (folder / CONFIG_NAME).write_text(config.to_yaml(), encoding="utf-8")
     return {
         "num_images": len(drive.images),
         "model": segmenter.name,

@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -20,9 +23,13 @@ from hdmap_tools.errors import ConfigError, DriveError, PoseError
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.intensity import otsu_threshold
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
+from hdmap_tools.segmentation.cache import LabelCache, segment_drive
+from hdmap_tools.segmentation.segmenter import Segmenter
+from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
 
 _LOG = logging.getLogger(__name__)
@@ -32,6 +39,9 @@ LabelledImages = Iterable[tuple[ImageRef, NDArrayByte]]
 _THRESHOLD_WITHOUT_LIDAR = 128
 _IMAGES_FOR_THRESHOLD = 24
 
+IMAGES_PER_SEGMENT: Final = 240
+"""Images fused between two commits; bounds the memory that counts take."""
+
 
 @dataclass
 class FrameCounts:
@@ -40,10 +50,12 @@ class FrameCounts:
     Attributes:
         used: Images that were fused.
         dropped: Number of images by reason.
+        observations: Labelled ground points by camera, of the main method.
     """
 
     used: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
+    observations: Counter[str] = field(default_factory=Counter)
 
 
 def require_images(drive: Drive) -> None:
@@ -65,12 +77,14 @@ class FrameSource:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The configured method of association, then those to compare with that the drive allows."""
+        """The configured method of association, then those to compare with."""
         association = self._config.association
         also = [m for m in association.also if m != association.method]
-        if association.method == "planar" and not self._drive.sweeps:
-            also = []
         return (association.method, *dict.fromkeys(also))
+
+    def allows(self, method: str, image: ImageRef) -> bool:
+        """Whether a method has what it needs at an image: all but ``planar`` need a sweep."""
+        return method == "planar" or self.sweep_ref(image) is not None
 
     def usable_images(self, counts: FrameCounts) -> tuple[ImageRef, ...]:
         """Images with a pose (and a sweep, where the method needs one); the rest is counted.
@@ -93,9 +107,7 @@ class FrameSource:
                     "the camera out with --camera, or repair the poses."
                 )
         counts.dropped["no ego pose"] = len(drive.images) - len(with_pose)
-        if self.methods == ("planar",):
-            return tuple(with_pose)
-        usable = [image for image in with_pose if self.sweep_ref(image) is not None]
+        usable = [image for image in with_pose if self.allows(config.association.method, image)]
         if not usable:
             raise DriveError(
                 f"Drive {drive.name}: no image has a lidar sweep within drive.max_sweep_gap_s = "
@@ -110,8 +122,14 @@ class FrameSource:
         return self._drive.trajectory.interpolate(timestamp_ns, self._config.drive.max_pose_gap_s)
 
     def sweep_ref(self, image: ImageRef) -> SweepRef | None:
-        """The sweep nearest to an image in time, if it is near enough."""
-        return self._drive.nearest_sweep(image.timestamp_ns, self._config.drive.max_sweep_gap_s)
+        """The sweep nearest to an image in time, if it is near enough and has a pose."""
+        config = self._config.drive
+        ref = self._drive.nearest_sweep(image.timestamp_ns, config.max_sweep_gap_s)
+        if ref is None:
+            return None
+        time = np.array([ref.timestamp_ns], dtype=np.int64)
+        has_pose = self._drive.trajectory.covers(time, config.max_pose_gap_s)[0]
+        return ref if has_pose else None
 
     def grounded_sweep(self, image: ImageRef) -> GroundedSweep | None:
         """The sweep nearest to an image, with its ground."""
@@ -143,8 +161,17 @@ class FrameSource:
         camera = self._drive.cameras[image.camera]
         pose, grounded = self.pose(image.timestamp_ns), self.grounded_sweep(image)
         if method == "planar":
-            plane = ground_plane(grounded)
-            return associate_planar(labels, label_set, camera, pose, plane, resolution_m, config)
+            plane_pose = pose if grounded is None else grounded.city_SE3_ego
+            return associate_planar(
+                labels,
+                label_set,
+                camera,
+                pose,
+                ground_plane(grounded),
+                plane_pose,
+                resolution_m,
+                config,
+            )
         if grounded is None:
             raise DriveError(f"No lidar sweep near image {image.key}; method {method!r} needs one.")
         if method == "sparse":
@@ -171,39 +198,34 @@ def fuse(
     source: FrameSource,
     labelled: LabelledImages,
     meta: MapMeta,
-    methods: tuple[str, ...],
+    commits: Mapping[str, Callable[[CellCounts], object]],
     counts: FrameCounts,
-) -> dict[str, CellCounts]:
-    """Associate and count labelled images, by each method on its own.
+) -> None:
+    """Associate and count labelled images, by each method on its own, segment by segment.
 
     Args:
-        source: Poses and sweeps.
+        source: Poses and sweeps; its `methods` are used.
         labelled: Images with their label images.
         meta: What the counts mean.
-        methods: Methods of association; one result each.
-        counts: Told how many images were used.
+        commits: By method, what takes the counts of a segment.
+        counts: Told how many images were used, and what they saw.
     """
-    result = {method: CellCounts(meta) for method in methods}
+    segments = {method: CellCounts(meta) for method in source.methods}
     for image, labels in labelled:
-        for method, cell_counts in result.items():
+        for method, segment in segments.items():
+            if not source.allows(method, image):
+                continue
             seen = source.observe(method, image, labels, meta.label_set, meta.resolution_m)
-            cell_counts.add(seen, frame_key(image))
+            segment.add(seen, frame_key(image))
+            if method == source.methods[0]:
+                counts.observations[image.camera] += len(seen)
+            if segment.num_frames >= IMAGES_PER_SEGMENT:
+                commits[method](segment)
+                segments[method] = CellCounts(meta)
         counts.used += 1
-    return result
-
-
-def in_segments(
-    labelled: LabelledImages, images_per_segment: int
-) -> Iterator[list[tuple[ImageRef, NDArrayByte]]]:
-    """Cut a stream of labelled images into pieces that are fused and committed one by one."""
-    segment: list[tuple[ImageRef, NDArrayByte]] = []
-    for item in labelled:
-        segment.append(item)
-        if len(segment) == images_per_segment:
-            yield segment
-            segment = []
-    if segment:
-        yield segment
+    for method, segment in segments.items():
+        if segment.num_frames:
+            commits[method](segment)
 
 
 def frame_key(image: ImageRef) -> int:
@@ -233,7 +255,7 @@ def intensity_threshold(
     with_sweep = tuple(image for image in images if source.sweep_ref(image) is not None)
     if not with_sweep:
         return _THRESHOLD_WITHOUT_LIDAR
-    step = max(len(with_sweep) // _IMAGES_FOR_THRESHOLD, 1)
+    step = -(-len(with_sweep) // _IMAGES_FOR_THRESHOLD)
     drivable = [label.id for label in label_set.labels if label.map_class in DRIVABLE_CLASSES]
     if not drivable:
         raise ConfigError(
@@ -252,3 +274,81 @@ def intensity_threshold(
         return 255
     _LOG.info("Intensity threshold k = %d, by Otsu on %d returns.", threshold, sum(map(len, seen)))
     return threshold
+
+
+def build_map(
+    drive: Drive,
+    segmenter: Segmenter,
+    path: Path,
+    config: Config,
+    cache: LabelCache | None,
+    steps: Steps,
+    also_in: Path | None = None,
+) -> tuple[dict[str, SemanticMap], FrameCounts]:
+    """Segment, associate and fuse a drive into new semantic maps, one for each method.
+
+    Args:
+        drive: Where images, sweeps and poses come from.
+        segmenter: Labels its images.
+        path: The map of the configured method.
+        config: Association, fusion and limits in time.
+        cache: Where label images are kept between runs.
+        steps: Told of progress.
+        also_in: Folder for the maps of the methods in `association.also`, by name;
+            None leaves them out.
+
+    Returns:
+        Maps by method, the configured one first; and what went in.
+
+    Raises:
+        DriveError: If no ground was seen at all.
+    """
+    if also_in is None:
+        config = config.model_copy(
+            update={"association": config.association.model_copy(update={"also": ()})}
+        )
+    counts = FrameCounts()
+    source = FrameSource(drive, config)
+    images = source.usable_images(counts)
+    for reason, number in counts.dropped.items():
+        if number:
+            _LOG.warning("%d of %d images left out: %s.", number, len(drive.images), reason)
+    looked_at: dict[ImageRef, NDArrayByte] = {}
+
+    def labels_of(some: tuple[ImageRef, ...]) -> LabelledImages:
+        for image, labels in segment_drive(drive, segmenter, some, cache):
+            looked_at[image] = labels
+            yield image, labels
+
+    def all_labels() -> LabelledImages:
+        # Labels made for the threshold are not made again; the order of frames does not matter.
+        rest = [image for image in images if image not in looked_at]
+        while looked_at:
+            yield looked_at.popitem()
+        yield from segment_drive(drive, segmenter, rest, cache, steps.segmented)
+
+    with steps.timed("segment and fuse"):
+        threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
+        meta = map_meta(config, drive, segmenter.label_set, segmenter.name, threshold)
+        maps = {
+            method: SemanticMap.create(
+                path if number == 0 or also_in is None else also_in / method, meta
+            )
+            for number, method in enumerate(source.methods)
+        }
+        commits = {method: partial(_commit, made, drive.id) for method, made in maps.items()}
+        fuse(source, all_labels(), meta, commits, counts)
+    silent = sorted({i.camera for i in images} - {c for c, n in counts.observations.items() if n})
+    if not maps[source.methods[0]].tile_indices():
+        raise DriveError(
+            f"Drive {drive.name}: {counts.used} images were fused and no ground was seen in any of them. "
+            f"Check the mounts of {', '.join(silent)} and of the lidar (`hdmap info`), and that sweeps hold "
+            "the ground around the vehicle."
+        )
+    if silent:
+        _LOG.warning("No ground was seen by %s; check their mounts.", ", ".join(silent))
+    return maps, counts
+
+
+def _commit(semantic_map: SemanticMap, drive_id: str, counts: CellCounts) -> None:
+    semantic_map.add(counts, drive_id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import tempfile
@@ -13,37 +14,74 @@ from typing import Final
 from hdmap_tools.errors import OutputExistsError, StoreError
 from hdmap_tools.fusion.semantic_map import is_semantic_map
 
-MARKER: Final = "hdmap.yaml"
-"""Each result folder holds the configuration it was made with; no other folder is ever replaced."""
+MARKER: Final = ".hdmap-result.json"
+"""Says which command made a folder, and what it wrote into it."""
+
+CONFIG_NAME: Final = "hdmap.yaml"
+"""The configuration that a result was made with."""
 
 
-def is_result(path: Path) -> bool:
-    """Whether a folder is a result of ours."""
-    return (path / MARKER).is_file()
-
-
-def require_free(path: Path, overwrite: bool, is_ours: Callable[[Path], bool] = is_result) -> None:
+def require_free(path: Path, overwrite: bool, is_ours: Callable[[Path], bool]) -> None:
     """Refuse an output folder that exists, unless it is an older result that may be replaced.
 
     Raises:
         OutputExistsError: With what was found and what to do.
     """
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+    if not os.path.lexists(path):
         return
-    if path.is_dir() and is_ours(path):
-        if overwrite:
+    if path.is_dir() and not path.is_symlink():
+        if not any(path.iterdir()):
             return
-        raise OutputExistsError(
-            f"{path} exists already; add --overwrite to replace it, or choose another folder."
-        )
+        if is_ours(path):
+            if overwrite:
+                return
+            raise OutputExistsError(
+                f"{path} exists already; add --overwrite to replace it, or choose another name."
+            )
     raise OutputExistsError(
-        f"{path} exists and is not a result of this command, so it is left alone; choose another name."
+        f"{path} exists and is not (only) a result of this command, so it is left alone; choose "
+        "another name."
     )
 
 
+def is_result_of(command: str) -> Callable[[Path], bool]:
+    """A check that a folder was made by a command and holds nothing that it did not write.
+
+    A folder into which somebody put files of his own is not replaced.
+    """
+
+    def is_ours(path: Path) -> bool:
+        try:
+            made = json.loads((path / MARKER).read_text(encoding="utf-8"))
+            written = {MARKER, *made["entries"]}
+            return made["command"] == command and {p.name for p in path.iterdir()} <= written
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+    return is_ours
+
+
 @contextlib.contextmanager
-def output_folder(
-    path: Path, overwrite: bool, is_ours: Callable[[Path], bool] = is_result
+def result_folder(path: Path, command: str, overwrite: bool) -> Iterator[Path]:
+    """`replaced_when_done` for the result of a command, marked so that it can be replaced later."""
+    with replaced_when_done(path, overwrite, is_result_of(command)) as folder:
+        yield folder
+        entries = sorted(p.name for p in folder.iterdir())
+        document = json.dumps({"command": command, "entries": entries}, indent=2)
+        (folder / MARKER).write_text(document + "\n", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def map_folder(path: Path, overwrite: bool) -> Iterator[Path]:
+    """`replaced_when_done` for a semantic map, which makes its own folder: nothing is there yet."""
+    with replaced_when_done(path, overwrite, is_semantic_map) as folder:
+        folder.rmdir()
+        yield folder
+
+
+@contextlib.contextmanager
+def replaced_when_done(
+    path: Path, overwrite: bool, is_ours: Callable[[Path], bool]
 ) -> Iterator[Path]:
     """Give a temporary folder that takes the output's name when the block ends without an error.
 
@@ -54,32 +92,42 @@ def output_folder(
 
     Raises:
         OutputExistsError: As `require_free`.
-        StoreError: If the folder cannot be made.
+        StoreError: If the folder cannot be made or written.
     """
     path = Path(os.path.abspath(path))
     require_free(path, overwrite, is_ours)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        parent = tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
-        temporary = Path(parent) / path.name
+        parent = Path(
+            tempfile.mkdtemp(prefix=f".{path.name[:100]}.", suffix=".partial", dir=path.parent)
+        )
+        temporary = parent / path.name
         temporary.mkdir()
     except OSError as error:
-        raise StoreError(
-            f"Cannot make a folder beside {path}: {error.strerror or error}."
-        ) from error
+        raise StoreError(f"Cannot make {path}: {error.strerror or error}.") from error
     try:
         yield temporary
         require_free(path, overwrite, is_ours)  # someone may have been quicker
-        if path.exists():
-            path.rename(Path(parent) / "replaced")
-        temporary.rename(path)
+        _put_in_place(temporary, path, parent / "replaced")
+    except OSError as error:
+        if isinstance(error, (StoreError, OutputExistsError)):
+            raise
+        raise StoreError(
+            f"Cannot write {path}: {error.strerror or error}. Nothing was changed; check free space and "
+            "permissions."
+        ) from error
     finally:
         shutil.rmtree(parent, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def map_folder(path: Path, overwrite: bool) -> Iterator[Path]:
-    """The same for a semantic map, which makes its own folder: nothing is there yet."""
-    with output_folder(path, overwrite, is_semantic_map) as folder:
-        folder.rmdir()
-        yield folder
+def _put_in_place(made: Path, path: Path, aside: Path) -> None:
+    """Rename a folder to its place; what was there comes back if that fails."""
+    had_older = path.exists()
+    if had_older:
+        path.rename(aside)
+    try:
+        made.rename(path)
+    except BaseException:
+        if had_older:
+            aside.rename(path)
+        raise

@@ -24,6 +24,7 @@ class RunMetrics(BaseModel):
         intensity_threshold: k, 0..255.
         num_images: Images fused.
         num_images_dropped: Images left out, by reason.
+        num_observations: Labelled ground points by camera.
         num_tiles: Tiles of the map with evidence.
         num_elements: Vector map elements by type.
         plugins: Vectorizers that ran, with distribution, version and options.
@@ -44,6 +45,7 @@ class RunMetrics(BaseModel):
     intensity_threshold: int
     num_images: int
     num_images_dropped: dict[str, int]
+    num_observations: dict[str, int]
     num_tiles: int
     num_elements: dict[str, int]
     plugins: list[dict[str, Any]]

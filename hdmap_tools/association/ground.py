@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hdmap_tools.association.visibility import ring_gap_deg
 from hdmap_tools.errors import ShapeError
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.readers.drive import Sweep
@@ -76,6 +77,7 @@ class GroundedSweep:
         city_SE3_ego: Ego pose at that time.
         points_city: (N, 3) the same points, city frame.
         surface: The ground, ego frame at that time.
+        ring_gap_deg: Angle between neighbouring rings.
         is_ground: (N,) bool: points on the ground.
     """
 
@@ -84,6 +86,7 @@ class GroundedSweep:
     points_city: NDArrayFloat
     surface: GroundSurface
     is_ground: NDArrayBool
+    ring_gap_deg: float
 
     @classmethod
     def from_sweep(
@@ -97,6 +100,7 @@ class GroundedSweep:
             city_SE3_ego.transform_from(sweep.points_ego),
             surface,
             near_ground(sweep.points_ego, surface, tolerance_m),
+            ring_gap_deg(sweep.points_ego, sweep.ring),
         )
 
 

@@ -24,8 +24,17 @@ def speaks_of_ground(labels: NDArrayByte, label_set: LabelSet) -> NDArrayBool:
     return np.asarray((labels != IGNORE_ID) & ~np.isin(labels, label_set.moving_ids))
 
 
+def camera_position(camera: PinholeCamera, city_SE3_ego: SE3) -> NDArrayFloat:
+    """City position (3,) of a camera at an ego pose, metres."""
+    return np.asarray(city_SE3_ego.transform_from(camera.ego_SE3_cam.translation[None])[0])
+
+
 def cell_centres_around(
-    camera: PinholeCamera, city_SE3_ego: SE3, resolution_m: float, reach_m: float
+    camera: PinholeCamera,
+    city_SE3_ego: SE3,
+    resolution_m: float,
+    reach_m: float,
+    min_range_m: float = 0.0,
 ) -> NDArrayFloat:
     """City positions (N, 2) of the lattice's cell centres that a camera may see.
 
@@ -33,12 +42,13 @@ def cell_centres_around(
     Those within reach and, seen from above, within the camera's view and a margin;
     which of them the image really holds, the projection says.
     """
-    centre = city_SE3_ego.transform_from(camera.ego_SE3_cam.translation[None])[0, :2]
+    centre = camera_position(camera, city_SE3_ego)[:2]
     middle = np.floor(centre / resolution_m)
     reach = np.arange(-(reach_m // resolution_m) - 1, reach_m // resolution_m + 2)
     steps = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
     xy = (middle + steps + 0.5) * resolution_m
-    near = np.linalg.norm(xy - centre, axis=1) <= reach_m
+    distance = np.linalg.norm(xy - centre, axis=1)
+    near = (distance <= reach_m) & (distance >= min_range_m)
     return np.asarray(xy[near & _may_be_in_view(xy - centre, camera, city_SE3_ego)])
 
 

@@ -46,6 +46,7 @@ def associate_planar(
     camera: PinholeCamera,
     city_SE3_ego: SE3,
     plane_ego: GroundPlane,
+    city_SE3_plane: SE3,
     resolution_m: float,
     config: AssociationConfig,
 ) -> Observations:
@@ -56,12 +57,16 @@ def associate_planar(
         label_set: What the ids mean.
         camera: Calibrated camera.
         city_SE3_ego: Ego pose at the image's own time.
-        plane_ego: The ground plane in the ego frame.
+        plane_ego: The ground plane in an ego frame,
+        city_SE3_plane: and the pose of that one: of the sweep that showed the plane, or
+            of the image where there is none.
         resolution_m: Cell size; one look-up at the centre of each cell.
-        config: `lookup_range_m` is the reach from the camera.
+        config: `lookup_range_m` and `min_range_m` from the camera.
     """
-    xy = cell_centres_around(camera, city_SE3_ego, resolution_m, config.lookup_range_m)
-    points_city = _onto_plane(xy, city_SE3_ego, plane_ego)
+    xy = cell_centres_around(
+        camera, city_SE3_ego, resolution_m, config.lookup_range_m, config.min_range_m
+    )
+    points_city = _onto_plane(xy, city_SE3_plane, plane_ego)
     projection = project_city(points_city, camera, city_SE3_ego)
     points_city, uv = points_city[projection.is_valid], projection.uv[projection.is_valid]
     labels = labels_at(label_image, uv)

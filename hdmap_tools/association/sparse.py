@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from hdmap_tools.association.ground import GroundedSweep
-from hdmap_tools.association.lookup import labels_at, project_city, speaks_of_ground
+from hdmap_tools.association.lookup import (
+    camera_position,
+    labels_at,
+    project_city,
+    speaks_of_ground,
+)
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.visibility import is_unoccluded
 from hdmap_tools.config import AssociationConfig
@@ -36,7 +41,11 @@ def associate_sparse(
     projection = project_city(grounded.points_city, camera, city_SE3_ego)
     use = projection.is_valid & grounded.is_ground
     if config.occlusion_test:
-        use &= is_unoccluded(projection, ~grounded.is_ground, camera)
+        use &= is_unoccluded(
+            projection, ~grounded.is_ground, camera, gap_v_deg=grounded.ring_gap_deg
+        )
+    from_camera = grounded.points_city[:, :2] - camera_position(camera, city_SE3_ego)[:2]
+    use &= np.linalg.norm(from_camera, axis=1) >= config.min_range_m
     use &= np.linalg.norm(grounded.sweep.points_ego[:, :2], axis=1) <= config.max_range_m
     labels = labels_at(label_image, projection.uv[use])
     speaks = speaks_of_ground(labels, label_set)

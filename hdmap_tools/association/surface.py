@@ -47,9 +47,11 @@ def associate_surface(
         city_SE3_ego: Ego pose at the image's own time.
         grounded: The sweep, which gives the ground and what stands on it.
         resolution_m: Cell size; one look-up at the centre of each cell.
-        config: `lookup_range_m` is the reach from the camera.
+        config: `lookup_range_m` and `min_range_m` from the camera.
     """
-    xy_city = cell_centres_around(camera, city_SE3_ego, resolution_m, config.lookup_range_m)
+    xy_city = cell_centres_around(
+        camera, city_SE3_ego, resolution_m, config.lookup_range_m, config.min_range_m
+    )
     points_city = _onto_surface(xy_city, grounded.city_SE3_ego, grounded.surface)
     projection = project_city(points_city, camera, city_SE3_ego)
     use = projection.is_valid
@@ -62,7 +64,7 @@ def associate_surface(
             np.concatenate([projection.is_valid, occluders.is_valid]),
         )
         is_occluder = np.arange(len(both.depth_m)) >= len(use)
-        use = is_unoccluded(both, is_occluder, camera)[: len(use)]
+        use = is_unoccluded(both, is_occluder, camera, gap_v_deg=grounded.ring_gap_deg)[: len(use)]
     labels = labels_at(label_image, projection.uv[use])
     speaks = speaks_of_ground(labels, label_set)
     points_city = points_city[use][speaks]

@@ -8,11 +8,13 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from hdmap_tools.geometry.camera import PinholeCamera, Projection
-from hdmap_tools.types import NDArrayBool
+from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
 
 _CELL_PX: Final = 4
 _NEAREST_M: Final = 2.0
 """Nearer returns come from the vehicle itself: roof, bonnet, the sensors' own mounts."""
+_LIDAR_HEIGHT_M: Final = 1.8
+_WIDEST_RING_GAP_DEG: Final = 2.1
 _MARGIN_M: Final = 0.5
 """A point must lie this much behind an occluder; covers extent and timing of moving things."""
 
@@ -23,7 +25,7 @@ def is_unoccluded(
     camera: PinholeCamera,
     *,
     gap_h_deg: float = 0.4,
-    gap_v_deg: float = 1.4,
+    gap_v_deg: float = 2.1,
 ) -> NDArrayBool:
     """Which projected points nothing nearer hides, by a depth buffer of the occluders.
 
@@ -36,8 +38,7 @@ def is_unoccluded(
         is_occluder: (N,) which of them can hide others: those above the ground.
         camera: The camera projected into.
         gap_h_deg: Angle between neighbouring returns of one ring.
-        gap_v_deg: Angle between neighbouring rings (1.33 degrees for 32 rings
-            over 40 degrees, the coarsest lidar in wide use).
+        gap_v_deg: Angle between neighbouring rings, see `ring_gap_deg`.
 
     Returns:
         (N,) bool; False for points that are not in the image.
@@ -51,13 +52,40 @@ def is_unoccluded(
     cell = np.zeros((len(visible), 2), dtype=np.int64)
     cell[projection.is_valid] = np.floor((projection.uv[projection.is_valid] + 0.5) / _CELL_PX)
     np.minimum.at(depth, (cell[blockers, 1], cell[blockers, 0]), projection.depth_m[blockers])
+    # A whole gap up and down, not half of one: below the lowest ring that meets a thing,
+    # its foot reaches down to the next, which may have met the ground before it.
     reach = (
-        _odd(np.deg2rad(gap_v_deg) * camera.fy / _CELL_PX),
+        _odd(2.0 * np.deg2rad(gap_v_deg) * camera.fy / _CELL_PX),
         _odd(np.deg2rad(gap_h_deg) * camera.fx / _CELL_PX),
     )
     depth = minimum_filter(depth, size=reach, mode="constant", cval=np.inf)
     behind = projection.depth_m > depth[cell[:, 1], cell[:, 0]] + _MARGIN_M
     return np.asarray(visible & ~(behind & ~is_occluder))
+
+
+def ring_gap_deg(points_ego: NDArrayFloat, ring: NDArrayByte) -> float:
+    """Angle between neighbouring rings of a sweep, with a margin, degrees; 2.1 when unknown.
+
+    Rings that are dense in the middle are coarse at the ends: the wide end counts.
+    2 degrees is the spacing of 16 rings over 30 degrees, the coarsest in wide use.
+
+    Args:
+        points_ego: (N, 3) of the sweep, metres; the lidar is taken to be 1.8 m up.
+        ring: (N,) laser number; all equal when unknown.
+    """
+    rings = np.unique(ring)
+    if len(rings) < 4:
+        return _WIDEST_RING_GAP_DEG
+    distance = np.linalg.norm(points_ego[:, :2], axis=1)
+    far = distance > 5.0
+    elevation = np.rad2deg(
+        np.arctan2(points_ego[far, 2] - _LIDAR_HEIGHT_M, np.maximum(distance[far], 1e-6))
+    )
+    medians = [float(np.median(elevation[ring[far] == r])) for r in rings if (ring[far] == r).any()]
+    if len(medians) < 4:
+        return _WIDEST_RING_GAP_DEG
+    gaps = np.diff(np.sort(medians))
+    return float(np.clip(1.1 * np.percentile(gaps, 90), 0.3, _WIDEST_RING_GAP_DEG))
 
 
 def _odd(cells: float) -> int:

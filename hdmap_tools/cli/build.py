@@ -14,6 +14,9 @@ from hdmap_tools.cli import options
 @click.option("-o", "--out", type=options.PATH, required=True, help="Semantic map to make.")
 @options.drive_options
 @options.segmentation_options
+@click.option(
+    "--like", type=options.PATH, help="Take this map's settings over, so that both can be merged."
+)
 @options.association_option
 @options.resolution_option
 @options.origin_option
@@ -27,12 +30,13 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     \b
     Examples:
       hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
-      hdmap build path/to/drive -o map --association sparse --resolution 0.2
+      hdmap build path/to/next_drive -o map2 --like map
 
     The map is a versioned repository of counts; read it with `hdmap vectorize`,
     `hdmap compare` and `hdmap info`, add maps with `hdmap merge`.
     """
-    from hdmap_tools.pipeline import Steps, build_alone
+    from hdmap_tools.single_steps import build_alone
+    from hdmap_tools.steps import Steps
 
     config = options.resolve_config(given, association__also=[], export__formats=[])
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
@@ -40,11 +44,12 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             given["drive"],
             given["out"],
             config,
+            like=given["like"],
             cache=options.label_cache(given["cache_folder"], given["no_cache"]),
             overwrite=given["overwrite"],
             steps=Steps(segmented),
         )
-    options.write_json(given["json_path"], report)
+    options.write_json(given["json_path"], report, overwrite=given["overwrite"])
     click.echo(
         f"{report['drive']}: {report['num_images']} images fused into {report['num_tiles']} tiles at "
         f"{given['out']} in {sum(report['seconds'].values()):.1f} s"

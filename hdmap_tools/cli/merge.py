@@ -23,10 +23,10 @@ def command(maps: tuple[Path, ...], out: Path, subtract: tuple[Path, ...], **giv
       hdmap merge monday tuesday -o week
       hdmap merge week -o without_monday --subtract monday
     """
-    from hdmap_tools.pipeline import merge_maps
+    from hdmap_tools.single_steps import merge_maps
 
     merged = merge_maps(maps, subtract, out, overwrite=given["overwrite"])
     drives = ", ".join(
         f"{name} ({entry['num_frames']} images)" for name, entry in merged.drives.items()
     )
-    click.echo(f"{out} holds {drives or 'no drive'} in {len(merged.tiles())} tiles")
+    click.echo(f"{out} holds {drives or 'no drive'} in {len(merged.tile_indices())} tiles")

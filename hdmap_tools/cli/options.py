@@ -80,6 +80,26 @@ def association_option(function: F) -> F:
     )(function)
 
 
+def confusion_option(function: F) -> F:
+    """--confusion."""
+    return click.option(
+        "--confusion",
+        type=PATH,
+        help="Confusion matrix to read the map with [default: the one known for the model].",
+    )(function)
+
+
+def vectorizer_option(function: F) -> F:
+    """--vectorizer."""
+    return click.option(
+        "--vectorizer",
+        "vectorizers",
+        multiple=True,
+        metavar="NAME",
+        help="Run this one and what it requires; repeatable [default: all installed].",
+    )(function)
+
+
 def resolution_option(function: F) -> F:
     """--resolution."""
     return click.option("--resolution", type=float, help="Cell size, metres [default: 0.1].")(
@@ -138,8 +158,11 @@ def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
     import yaml
 
     from hdmap_tools.config import load_config
-    from hdmap_tools.errors import ConfigError
+    from hdmap_tools.errors import ConfigError, OutputExistsError
 
+    json_path = given.get("json_path")
+    if json_path is not None and json_path.exists() and not given.get("overwrite"):
+        raise OutputExistsError(f"{json_path} exists; use --overwrite to replace it.")
     dotted: dict[str, Any] = {}
     for setting in given["settings"]:
         name, equals, value = setting.partition("=")
@@ -228,12 +251,16 @@ class ImageProgress:
         self._progress.update(self._task, completed=done, total=total)
 
 
-def write_json(path: Path | None, document: Any) -> None:
-    """Write a --json file, whole or not at all; an older one is replaced."""
+def write_json(path: Path | None, document: Any, overwrite: bool = False) -> None:
+    """Write a --json file, whole or not at all.
+
+    Raises:
+        OutputExistsError: If there is a file and overwrite is False: it may be anything.
+    """
     if path is None:
         return
     from hdmap_tools.formats.atomic import atomic_output
 
     text = document if isinstance(document, str) else json.dumps(document, indent=2) + "\n"
-    with atomic_output(path, overwrite=True) as temporary:
+    with atomic_output(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     help="Build this method's map too, to compare with; repeatable [default: sparse and planar].",
 )
 @options.resolution_option
+@options.confusion_option
+@options.vectorizer_option
 @click.option(
     "--reference", type=options.PATH, help="Mask PNG (with JSON) or vector map to compare with."
 )
@@ -46,7 +48,8 @@ def command(ctx: click.Context, /, **given: Any) -> int:
     and hdmap.yaml (the configuration used) into the folder OUT.
     """
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
-    from hdmap_tools.pipeline import Steps, run
+    from hdmap_tools.pipeline import run
+    from hdmap_tools.steps import Steps
 
     config = options.resolve_config(given)
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
@@ -58,7 +61,7 @@ def command(ctx: click.Context, /, **given: Any) -> int:
             overwrite=given["overwrite"],
             steps=Steps(segmented),
         )
-    options.write_json(given["json_path"], result.metrics.to_json())
+    options.write_json(given["json_path"], result.metrics.to_json(), overwrite=given["overwrite"])
     click.echo(summary(result.metrics, given["out"]))
     for failure in result.failures:
         click.echo(f"Error: {failure.describe()}", err=True)

@@ -12,14 +12,8 @@ from hdmap_tools.cli import options
 @click.command()
 @click.argument("semantic_map", type=options.PATH)
 @click.option("-o", "--out", type=options.PATH, required=True, help="GeoPackage to make.")
-@click.option(
-    "--vectorizer",
-    "vectorizers",
-    multiple=True,
-    metavar="NAME",
-    help="Run this one and what it requires; repeatable [default: all installed].",
-)
-@click.option("--confusion", type=options.PATH, help="Confusion matrix to read the map with.")
+@options.vectorizer_option
+@options.confusion_option
 @options.overwrite_option
 @options.json_option
 @options.config_options
@@ -32,7 +26,7 @@ def command(**given: Any) -> int:
       hdmap vectorize map -o marks.gpkg --vectorizer lane_mark_skeleton
     """
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
-    from hdmap_tools.pipeline import vectorize_alone
+    from hdmap_tools.single_steps import vectorize_alone
 
     config = options.resolve_config(given)
     result = vectorize_alone(
@@ -46,6 +40,7 @@ def command(**given: Any) -> int:
             "plugins": result.vector_map.provenance.get("plugins", []),
             "failures": {failure.name: failure.message for failure in result.failures},
         },
+        overwrite=given["overwrite"],
     )
     click.echo(
         f"{', '.join(f'{n} {name}' for name, n in counts.items()) or 'No elements'} in {given['out']}"

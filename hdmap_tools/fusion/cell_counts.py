@@ -172,6 +172,10 @@ class CellCounts:
         theirs = {i: t for i, t in other.tiles.items() if not t.is_empty}
         return mine.keys() == theirs.keys() and all(t.equals(theirs[i]) for i, t in mine.items())
 
+    def tile_indices(self) -> tuple[TileIndex, ...]:
+        """Indices of the tiles, sorted."""
+        return tuple(sorted(self.tiles))
+
     @property
     def grid(self) -> BevGrid | None:
         """The smallest grid that covers all tiles, or None when there are none."""
@@ -261,7 +265,15 @@ def grid_of_tiles(indices: Iterable[TileIndex], meta: MapMeta) -> BevGrid | None
 
 
 def window_of_tiles(read: Callable[[TileIndex], Tile | None], grid: BevGrid, meta: MapMeta) -> Tile:
-    """Cut a window out of tiles; zeros where `read` gives None."""
+    """Cut a window out of tiles; zeros where `read` gives None.
+
+    Raises:
+        MapMismatchError: If the grid has another resolution than the map.
+    """
+    if grid.resolution_m != meta.resolution_m:
+        raise MapMismatchError(
+            f"A window of {grid.resolution_m} m was asked of a map of {meta.resolution_m} m."
+        )
     window = Tile.zeros(len(meta.label_set), meta.num_bins, grid.shape)
     for ty in range(grid.y_min // TILE_CELLS, -(-grid.y_max // TILE_CELLS)):
         for tx in range(grid.x_min // TILE_CELLS, -(-grid.x_max // TILE_CELLS)):

@@ -80,7 +80,7 @@ class MapMeta(BaseModel):
             differing = [f"label set {self.label_set.name!r} with different labels"]
         if differing:
             raise MapMismatchError(
-                f"The maps cannot be added, they differ in {'; '.join(differing)}. Build both with "
-                "the same settings (hdmap.yaml: fusion, segmentation)."
+                f"The maps cannot be added, they differ in {'; '.join(differing)}. Build the second "
+                "with `hdmap build --like FIRST`, which takes its settings over."
             )
         self.frame.require_same(other.frame)

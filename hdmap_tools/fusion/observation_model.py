@@ -17,9 +17,9 @@ import numpy as np
 from hdmap_tools.config import ObservationConfig
 from hdmap_tools.errors import ConfigError, LabelError
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.labels.label_set import LabelSet, MapClass
+from hdmap_tools.labels.label_set import Label, LabelSet, MapClass
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
-from hdmap_tools.types import NDArrayAny, NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat
 
 _LOG = logging.getLogger(__name__)
 
@@ -80,14 +80,24 @@ def observation_model(
         LabelError: If the confusion matrix is for another label set.
     """
     names = (*(str(c) for c in classes), *((OTHER,) if config.other else ()))
-    if config.model == "vanilla":
+    kind = config.model
+    if kind == "auto":
+        kind = "vanilla" if confusion is None else "confusion"
+        if confusion is None:
+            _LOG.warning(
+                "No confusion matrix is known for the labels of %s (%s): each label is believed alike. "
+                "Measure one with `hdmap confusion` and give it with --confusion.",
+                meta.model,
+                meta.label_set.name,
+            )
+    if kind == "vanilla":
         likelihood, can_tell = vanilla_likelihood(meta.label_set, names, config.vanilla_lambda)
     else:
         if confusion is None:
             raise ConfigError(
-                f"Observation model 'confusion' needs the confusion matrix of model {meta.model!r}, and "
-                "none is known. Measure one with `hdmap confusion` and give it with --confusion, or use "
-                "observation.model: vanilla."
+                f"Observation model 'confusion' needs a confusion matrix for label set "
+                f"{meta.label_set.name!r} of {meta.model!r}, and none is known. Measure one with `hdmap "
+                "confusion` and give it with --confusion, or use observation.model: vanilla."
             )
         if confusion.predicted_set.names != meta.label_set.names:
             raise LabelError(
@@ -111,7 +121,7 @@ def observation_model(
     return ObservationModel(
         names,
         log_likelihood,
-        _log_prior(config.priors, names, can_tell),
+        _log_prior(config, names, can_tell),
         1.0 / (meta.quanta_per_vote * config.temperature),
     )
 
@@ -122,15 +132,16 @@ def vanilla_likelihood(
     """M = mu (I + lambda 1), rectangular: each label stands for its class, or for `OTHER`.
 
     Returns:
-        (class, label) rows that sum to 1, and which classes have a label.
+        (class, label) rows that sum to 1 over the labels that are counted, and which
+        classes have a label.
     """
     matrix = np.full((len(names), len(label_set)), lam)
     for label in label_set.labels:
-        name = str(label.map_class) if label.map_class is not None else OTHER
-        if name in names:
+        name = _class_among(label, names)
+        if name in names and not label.moves:
             matrix[names.index(name), label.id] += 1.0
     can_tell = [bool((row > lam).any()) for row in matrix]
-    return matrix / matrix.sum(axis=1, keepdims=True), can_tell
+    return _normalized(matrix, label_set), can_tell
 
 
 def confusion_likelihood(
@@ -142,37 +153,59 @@ def confusion_likelihood(
     normalized. Smoothing adds the share ``smoothing`` of a row, spread evenly.
 
     Returns:
-        (class, label) rows that sum to 1, and which classes have a measured row.
+        (class, label) rows that sum to 1 over the labels that are counted, and which
+        classes have a measured row.
     """
+    is_counted = _is_counted(confusion.predicted_set)
     rows = []
     for name in names:
         members = [
-            label.id
-            for label in confusion.true_set.labels
-            if (OTHER if label.map_class is None else str(label.map_class)) == name
+            label.id for label in confusion.true_set.labels if _class_among(label, names) == name
         ]
-        rows.append(confusion.counts[members].sum(axis=0).astype(np.float64))
-    counts = np.array(rows)
+        rows.append(confusion.counts[members].sum(axis=0) * is_counted)
+    counts = np.array(rows, dtype=np.float64)
     totals = counts.sum(axis=1, keepdims=True)
     can_tell = [bool(total > 0) for total in totals[:, 0]]
-    normalized = np.where(totals > 0, counts / np.maximum(totals, 1.0), 1.0 / counts.shape[1])
-    return (1.0 - smoothing) * normalized + smoothing / counts.shape[1], can_tell
+    even = is_counted / is_counted.sum()
+    normalized = np.where(totals > 0, counts / np.maximum(totals, 1.0), even)
+    smoothed = (1.0 - smoothing) * normalized + smoothing * even
+    # Votes for moving objects never reach the counts; any finite value does.
+    return np.where(is_counted, smoothed, 1.0), can_tell
+
+
+def _class_among(label: Label, names: tuple[str, ...]) -> str:
+    """The class of these that a label is; `OTHER` if it is none of them."""
+    name = OTHER if label.map_class is None else str(label.map_class)
+    return name if name in names else OTHER
+
+
+def _is_counted(label_set: LabelSet) -> NDArrayBool:
+    """(label,) bool: association leaves labels of moving objects out, so rows must not hold them."""
+    return np.array([not label.moves for label in label_set.labels])
+
+
+def _normalized(matrix: NDArrayFloat, label_set: LabelSet) -> NDArrayFloat:
+    is_counted = _is_counted(label_set)
+    sums = (matrix * is_counted).sum(axis=1, keepdims=True)
+    return np.where(is_counted, matrix / sums, 1.0)
 
 
 def _log_prior(
-    priors: dict[MapClass, float], names: tuple[str, ...], can_tell: list[bool]
+    config: ObservationConfig, names: tuple[str, ...], can_tell: list[bool]
 ) -> NDArrayFloat:
-    given = {str(c): p for c, p in priors.items() if str(c) in names}
-    if any(not 0.0 <= p <= 1.0 for p in given.values()) or sum(given.values()) > 1.0 + 1e-9:
+    """Natural logarithm of the prior: as given, `OTHER` from what is left, the rest shared."""
+    prior = {str(c): p for c, p in config.priors.items() if str(c) in names}
+    if sum(prior.values()) > 1.0 + 1e-9:
         raise ConfigError(
-            f"observation.priors must be probabilities that sum to at most 1, found {given}."
+            f"observation.priors must be probabilities that sum to at most 1, found {prior}."
         )
-    open_names = [n for n, told in zip(names, can_tell, strict=True) if told and n not in given]
-    rest = max(1.0 - sum(given.values()), 0.0) / max(len(open_names), 1)
-    prior = np.array(
-        [given.get(name, rest) if told else 0.0 for name, told in zip(names, can_tell, strict=True)]
-    )
-    if prior.sum() <= 0.0:
+    if OTHER in names:
+        prior[OTHER] = min(config.other_prior, 1.0 - sum(prior.values()))
+    told = [name for name, is_told in zip(names, can_tell, strict=True) if is_told]
+    open_names = [name for name in told if name not in prior]
+    rest = max(1.0 - sum(prior.values()), 0.0) / max(len(open_names), 1)
+    values = np.array([prior.get(name, rest) if name in told else 0.0 for name in names])
+    if values.sum() <= 0.0:
         raise ConfigError("No class is left with a prior above 0; check observation.priors.")
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(prior / prior.sum()))
+        return np.asarray(np.log(values / values.sum()))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
 
-from hdmap_tools.fusion.cell_counts import Tile
+from hdmap_tools.fusion.cell_counts import TILE_CELLS, Tile, TileIndex
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.observation_model import ObservationModel
 from hdmap_tools.geometry.grid import BevGrid
@@ -19,6 +20,10 @@ class HasCounts(Protocol):
 
     meta: MapMeta
 
+    def tile_indices(self) -> tuple[TileIndex, ...]:
+        """Indices of the tiles that may hold evidence."""
+        ...
+
     def window(self, grid: BevGrid) -> Tile:
         """The layers over a grid."""
         ...
@@ -28,6 +33,9 @@ def read_window(
     source: HasCounts, grid: BevGrid, model: ObservationModel, fill_radius_cells: int = 0
 ) -> MapWindow:
     """The posterior and its companions over a grid.
+
+    Counts are read tile by tile and where there are any, so that beside the result
+    (4 bytes a cell, class and layer) only a tile's counts are in memory.
 
     Args:
         source: Where the counts come from.
@@ -39,44 +47,66 @@ def read_window(
     """
     import xarray as xr
 
-    # A margin, so that filling does not see the window's edge.
-    wide = grid.expand(fill_radius_cells)
-    layers = source.window(wide).layers
+    posterior = np.full((len(model.classes), *grid.shape), np.nan, dtype=np.float32)
+    layers = {
+        "entropy": np.full(grid.shape, np.nan, dtype=np.float32),
+        "observations": np.zeros(grid.shape, dtype=np.float32),
+        "intensity": np.full(grid.shape, np.nan, dtype=np.float32),
+        "height": np.full(grid.shape, np.nan, dtype=np.float32),
+    }
+    for block in _blocks_with_evidence(source.tile_indices(), grid, fill_radius_cells):
+        rows = slice(block.y_min - grid.y_min, block.y_max - grid.y_min)
+        cols = slice(block.x_min - grid.x_min, block.x_max - grid.x_min)
+        posterior[:, rows, cols], read = _read_block(source, block, model, fill_radius_cells)
+        for name, values in read.items():
+            layers[name][rows, cols] = values
+    dataset = xr.Dataset(
+        {
+            "posterior": (("class", "y", "x"), posterior),
+            **{name: (("y", "x"), values) for name, values in layers.items()},
+        },
+        coords={"class": list(model.classes), "y": grid.y_centres_m, "x": grid.x_centres_m},
+    )
+    return MapWindow(dataset, grid)
+
+
+def _blocks_with_evidence(
+    tiles: tuple[TileIndex, ...], grid: BevGrid, reach_cells: int
+) -> Iterator[BevGrid]:
+    """The grid cut along tiles; only pieces with a tile in them or within reach."""
+    near = -(-reach_cells // TILE_CELLS)
+    steps = range(-near, near + 1)
+    wanted = {(tx + dx, ty + dy) for tx, ty in tiles for dx in steps for dy in steps}
+    for tx, ty in sorted(wanted):
+        x0, y0 = max(grid.x_min, tx * TILE_CELLS), max(grid.y_min, ty * TILE_CELLS)
+        x1 = min(grid.x_max, (tx + 1) * TILE_CELLS)
+        y1 = min(grid.y_max, (ty + 1) * TILE_CELLS)
+        if x0 < x1 and y0 < y1:
+            yield BevGrid(grid.resolution_m, x0, y0, x1, y1, grid.frame)
+
+
+def _read_block(
+    source: HasCounts, block: BevGrid, model: ObservationModel, radius: int
+) -> tuple[NDArrayFloat, dict[str, NDArrayAny]]:
+    """Posterior (class, y, x) and the other layers (y, x) of one block."""
+    # A margin, so that filling does not see the block's edge.
+    layers = source.window(block.expand(radius)).layers
     counts = layers["counts"]
     posterior = model.posterior(counts)
-    if fill_radius_cells > 0:
+    if radius > 0:
         unknown = np.isnan(posterior[0])
-        filled = model.posterior(box_mean(counts, fill_radius_cells))
-        posterior = np.where(unknown, filled, posterior)
+        if not unknown.all():
+            filled = model.posterior(box_mean(counts, radius))
+            posterior = np.where(unknown, filled, posterior)
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = -np.where(posterior > 0, posterior * np.log(posterior), 0.0).sum(axis=0)
         entropy[np.isnan(posterior[0])] = np.nan
         height = layers["height_sum"] / layers["height_n"] / 1000.0 + source.meta.reference_height_m
         intensity = layers["intensity_sum"] / layers["intensity_n"]
     votes = counts.sum(axis=(0, 1), dtype=np.float64) / source.meta.quanta_per_vote
-    inner = (
-        (slice(fill_radius_cells, -fill_radius_cells),) * 2
-        if fill_radius_cells
-        else (slice(None), slice(None))
-    )
-
-    def plane(values: NDArrayAny) -> tuple[tuple[str, str], NDArrayAny]:
-        return ("y", "x"), np.ascontiguousarray(values[inner], dtype=np.float32)
-
-    dataset = xr.Dataset(
-        {
-            "posterior": (
-                ("class", "y", "x"),
-                np.ascontiguousarray(posterior[(slice(None), *inner)], dtype=np.float32),
-            ),
-            "entropy": plane(entropy),
-            "observations": plane(votes),
-            "intensity": plane(intensity),
-            "height": plane(height),
-        },
-        coords={"class": list(model.classes), "y": grid.y_centres_m, "x": grid.x_centres_m},
-    )
-    return MapWindow(dataset, grid)
+    inner = slice(radius, posterior.shape[1] - radius), slice(radius, posterior.shape[2] - radius)
+    read = {"entropy": entropy, "observations": votes, "intensity": intensity, "height": height}
+    return posterior[:, *inner], {name: values[inner] for name, values in read.items()}
 
 
 def box_mean(counts: NDArrayAny, radius: int) -> NDArrayFloat:
@@ -91,8 +121,10 @@ def box_mean(counts: NDArrayAny, radius: int) -> NDArrayFloat:
     size = 2 * radius + 1
     observed = counts.any(axis=(0, 1)).astype(np.float64)
     share = uniform_filter(observed, size, mode="constant")
-    channels = counts.reshape(-1, *counts.shape[2:]).astype(np.float64)
-    sums = np.stack([uniform_filter(channel, size, mode="constant") for channel in channels])
+    channels = counts.reshape(-1, *counts.shape[2:])
+    sums = np.stack(
+        [uniform_filter(channel.astype(np.float64), size, mode="constant") for channel in channels]
+    )
     sums = sums.reshape(counts.shape)
     # Below half a cell of the box the filter's rounding is all there is.
     there = share > 0.5 / size**2

@@ -3,13 +3,14 @@
 Layout of the Zarr v3 group: one array a layer of `cell_counts.LAYERS`, spanning
 `LATTICE_CELLS` a side with a chunk a tile, so that only tiles with evidence
 take space; the map's meta and the drives it holds in the group's attributes.
+Chunks carry checksums: a damaged one is an error, never a wrong count.
 On a local disk exactly one process may commit at a time.
 """
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -40,6 +41,11 @@ if TYPE_CHECKING:
 
 _BRANCH: Final = "main"
 _HALF: Final = LATTICE_CELLS // 2
+_REQUIRED_FOLDERS: Final = {"refs", "snapshots"}
+_KNOWN_FOLDERS: Final = _REQUIRED_FOLDERS | {"chunks", "manifests", "transactions", "config.yaml"}
+
+Drives = dict[str, dict[str, Any]]
+"""What a map holds, by drive id: ``{"num_frames": n}``."""
 
 
 @dataclass(frozen=True)
@@ -76,34 +82,27 @@ class SemanticMap:
         self._version = version
 
     @classmethod
-    def create(cls, path: Path, meta: MapMeta, *, overwrite: bool = False) -> SemanticMap:
+    def create(cls, path: Path, meta: MapMeta) -> SemanticMap:
         """Make an empty map.
 
         Raises:
-            OutputExistsError: If something is there and overwrite is false, or if
-                what is there is not a semantic map.
+            OutputExistsError: If something is there already.
             StoreError: If the folder cannot be written.
         """
         icechunk = _icechunk()
         import zarr
+        from zarr.codecs import ZstdCodec
 
         if path.exists():
-            if not overwrite:
-                raise OutputExistsError(
-                    f"{path} exists already; add --overwrite to replace it, or choose another output."
-                )
-            if not is_semantic_map(path):
-                raise OutputExistsError(
-                    f"{path} exists and is not a semantic map; it is left alone."
-                )
-            shutil.rmtree(path)
-        try:
+            raise OutputExistsError(f"{path} exists already; choose another name.")
+        with _store_errors(f"Cannot make a map at {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             repository = icechunk.Repository.create(icechunk.local_filesystem_storage(str(path)))
             session = repository.writable_session(_BRANCH)
             group = zarr.create_group(store=session.store)
             group.attrs["meta"] = meta.model_dump(mode="json")
             group.attrs["drives"] = {}
+            group.attrs["num_tiles"] = 0
             for name, dtype in LAYERS.items():
                 lead = (len(meta.label_set), meta.num_bins) if name == "counts" else ()
                 group.create_array(
@@ -112,10 +111,9 @@ class SemanticMap:
                     chunks=(*lead, TILE_CELLS, TILE_CELLS),
                     dtype=dtype,
                     fill_value=0,
+                    compressors=ZstdCodec(level=1, checksum=True),
                 )
             session.commit("Empty map")
-        except (OSError, icechunk.IcechunkError) as error:
-            raise StoreError(f"Cannot make a map at {path}: {_one_line(error)}") from error
         return cls(path, repository, meta, None)
 
     @classmethod
@@ -131,7 +129,7 @@ class SemanticMap:
         if not is_semantic_map(path):
             found = "nothing" if not path.exists() else "something else"
             raise StoreError(f"No semantic map at {path} (found {found}); `hdmap build` makes one.")
-        try:
+        with _store_errors(f"Cannot open the map at {path}"):
             repository = icechunk.Repository.open(icechunk.local_filesystem_storage(str(path)))
             session = (
                 repository.readonly_session(_BRANCH)
@@ -139,8 +137,6 @@ class SemanticMap:
                 else repository.readonly_session(snapshot_id=version)
             )
             document = zarr.open_group(session.store, mode="r").attrs["meta"]
-        except (OSError, KeyError, ValueError, icechunk.IcechunkError) as error:
-            raise StoreError(f"Cannot open the map at {path}: {_one_line(error)}") from error
         found_version = document.get("schema_version") if isinstance(document, dict) else None
         if found_version != MAP_SCHEMA_VERSION:
             raise StoreError(
@@ -150,58 +146,65 @@ class SemanticMap:
         try:
             meta = MapMeta.model_validate(document)
         except ValidationError as error:
-            raise StoreError(f"The map at {path} has a damaged description: {error}") from error
+            fields = ", ".join(".".join(map(str, e["loc"])) for e in error.errors())
+            raise StoreError(
+                f"The map at {path} has a damaged description ({fields}); build it anew."
+            ) from error
         return cls(path, repository, meta, version)
 
     @property
-    def drives(self) -> dict[str, dict[str, Any]]:
+    def drives(self) -> Drives:
         """What was added, by drive id: number of frames."""
-        return dict(self._group().attrs["drives"])  # type: ignore[arg-type]
+        with self._reading():
+            return _drives_of(self._group())
 
     def history(self) -> list[Version]:
         """All versions, newest first."""
         start = {"branch": _BRANCH} if self._version is None else {"snapshot_id": self._version}
-        return [
-            Version(info.id, info.written_at, info.message, dict(info.metadata))
-            for info in self._repository.ancestry(**start)
-        ]
+        with self._reading():
+            return [
+                Version(info.id, info.written_at, info.message, dict(info.metadata))
+                for info in self._repository.ancestry(**start)
+            ]
 
-    def tiles(self) -> tuple[TileIndex, ...]:
+    def tile_indices(self) -> tuple[TileIndex, ...]:
         """Indices of the tiles that hold evidence, sorted."""
-        from zarr.core.sync import sync
-
-        session = self._session()
-
-        async def listed() -> set[TileIndex]:
-            # Heights come with every observation, votes too: either lists all tiles.
-            return {
-                (c[-1] - _HALF // TILE_CELLS, c[-2] - _HALF // TILE_CELLS)
-                async for c in session.chunk_coordinates("/height_n")
-            }
-
-        return tuple(sorted(sync(listed())))
+        with self._reading():
+            found = _listed(self._session())
+            expected = self._group().attrs["num_tiles"]
+        # The store's own index of chunks carries no checksum.
+        if len(found) != expected:
+            raise StoreError(
+                f"The map at {self.path} is damaged: it lists {len(found)} tiles and should hold {expected}; "
+                "build it anew or take a copy."
+            )
+        return found
 
     @property
     def grid(self) -> BevGrid | None:
         """The smallest grid that covers all tiles, or None for an empty map."""
-        return grid_of_tiles(self.tiles(), self.meta)
+        return grid_of_tiles(self.tile_indices(), self.meta)
 
     def read_tile(self, index: TileIndex) -> Tile:
         """The layers of one tile; zeros where nothing was observed."""
-        return _read_tile(self._group(), index)
+        with self._reading():
+            return _read_tile(self._group(), index)
 
     def window(self, grid: BevGrid) -> Tile:
-        """The layers over any grid of this map's lattice."""
-        present, group = set(self.tiles()), self._group()
-        return window_of_tiles(
-            lambda index: _read_tile(group, index) if index in present else None, grid, self.meta
-        )
+        """The layers over any grid of this map's lattice.
+
+        Raises:
+            MapMismatchError: If the grid has another resolution.
+        """
+        read = self._tile_reader()
+        return window_of_tiles(read, grid, self.meta)
 
     def read(self) -> CellCounts:
         """All counts, in memory."""
         counts = CellCounts(self.meta)
-        group = self._group()
-        counts.tiles = {index: _read_tile(group, index) for index in self.tiles()}
+        with self._reading():
+            group = self._group()
+            counts.tiles = {index: _read_tile(group, index) for index in self.tile_indices()}
         counts.num_frames = sum(drive["num_frames"] for drive in self.drives.values())
         return counts
 
@@ -212,74 +215,124 @@ class SemanticMap:
             MapMismatchError: If the counts are of another kind of map, or overflow.
             StoreError: If the commit fails; the map then stays as it was.
         """
+        self.meta.require_compatible(counts.meta)
         drives = {drive_id: {"num_frames": counts.num_frames}}
-        return self._apply(counts, 1, message or f"Add {drive_id}", drives)
+        tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
+        shift = self._shift_mm(counts.meta)
+        return self._apply(tiles, shift, 1, message or f"Add {drive_id}", lambda _: drives)
 
-    def merge(self, other: SemanticMap) -> str:
-        """Add all that another map holds.
+    def merge(self, other: SemanticMap, name: str = "") -> str:
+        """Add all that another map holds, tile by tile.
+
+        Args:
+            other: The map to add.
+            name: What to call it in history and messages; its folder's name if empty.
 
         Raises:
             MapMismatchError: If the maps are not compatible, or hold a drive in common.
         """
         self.meta.require_compatible(other.meta)
-        common = sorted(self.drives.keys() & other.drives.keys())
-        if common:
-            raise MapMismatchError(
-                f"Both maps hold {', '.join(common)}; adding it twice would count it twice. "
-                "Subtract it from one of them first."
-            )
-        return self._apply(other.read(), 1, f"Merge {other.path.name}", other.drives)
+        theirs = other.drives
 
-    def subtract(self, other: SemanticMap) -> str:
+        def checked(held: Drives) -> Drives:
+            common = sorted(held.keys() & theirs.keys())
+            if common:
+                raise MapMismatchError(
+                    f"Both maps hold {', '.join(common)}; adding it twice would count it twice. "
+                    "Subtract it from one of them first."
+                )
+            return theirs
+
+        message = f"Merge {name or other.path.name}"
+        return self._apply(other._all_tiles(), self._shift_mm(other.meta), 1, message, checked)
+
+    def subtract(self, other: SemanticMap, name: str = "") -> str:
         """Take all that another map holds out of this one.
 
         Raises:
             MapMismatchError: If this map does not hold the other's drives and counts.
         """
         self.meta.require_compatible(other.meta)
-        missing = sorted(other.drives.keys() - self.drives.keys())
-        if missing:
-            raise MapMismatchError(
-                f"{self.path} does not hold {', '.join(missing)}, so it cannot be subtracted; "
-                f"it holds {', '.join(sorted(self.drives)) or 'no drive'}."
-            )
-        return self._apply(other.read(), -1, f"Subtract {other.path.name}", other.drives)
+        theirs, called = other.drives, name or other.path.name
+
+        def checked(held: Drives) -> Drives:
+            missing = sorted(theirs.keys() - held.keys())
+            if missing:
+                raise MapMismatchError(
+                    f"{called} cannot be subtracted: it holds {', '.join(missing)}, which the map does "
+                    f"not hold; the map holds {', '.join(sorted(held)) or 'no drive'}."
+                )
+            return theirs
+
+        shift = self._shift_mm(other.meta)
+        return self._apply(other._all_tiles(), shift, -1, f"Subtract {called}", checked)
+
+    def _shift_mm(self, other: MapMeta) -> int:
+        return round((other.reference_height_m - self.meta.reference_height_m) * 1000)
+
+    def _all_tiles(self) -> Iterator[tuple[TileIndex, Tile]]:
+        read = self._tile_reader()
+        for index in self.tile_indices():
+            tile = read(index)
+            assert tile is not None
+            yield index, tile
+
+    def _tile_reader(self) -> Callable[[TileIndex], Tile | None]:
+        present = set(self.tile_indices())
+        with self._reading():
+            group = self._group()
+
+        def read(index: TileIndex) -> Tile | None:
+            if index not in present:
+                return None
+            with self._reading():
+                return _read_tile(group, index)
+
+        return read
 
     def _apply(
-        self, counts: CellCounts, sign: int, message: str, drives: dict[str, dict[str, Any]]
+        self,
+        tiles: Iterator[tuple[TileIndex, Tile]],
+        shift_mm: int,
+        sign: int,
+        message: str,
+        checked_drives: Callable[[Drives], Drives],
     ) -> str:
-        import icechunk
+        """Add (sign 1) or subtract tiles and commit; the drives are checked in the same session."""
         import zarr
 
         if self._version is not None:
             raise StoreError(f"{self.path} is open at an old version, which cannot be changed.")
-        self.meta.require_compatible(counts.meta)
-        shift_mm = round((counts.meta.reference_height_m - self.meta.reference_height_m) * 1000)
-        session = self._repository.writable_session(_BRANCH)
-        try:
-            group = zarr.open_group(session.store)
-            for index in sorted(counts.tiles):
-                tile = counts.tiles[index]
-                if tile.is_empty:
-                    continue
-                summed = combine_tiles(
-                    _read_tile(group, index), shift_heights(tile, shift_mm), sign, index
-                )
-                _write_tile(group, index, summed)
-            group.attrs["drives"] = _changed_drives(
-                dict(group.attrs["drives"]),  # type: ignore[arg-type]
-                drives,
-                sign,
-            )
-            return session.commit(message, metadata={"drives": drives, "sign": sign})
-        except HDMapError:
-            session.discard_changes()
-            raise
-        except (OSError, icechunk.IcechunkError) as error:
-            raise StoreError(
-                f"Could not commit to {self.path}: {_one_line(error)}. The map is as it was before; "
-                "check free space and that no other process is writing it."
-            ) from error
+        failed = (
+            f"Could not commit to {self.path}, the map is as it was before (check free space, and that no "
+            "other process writes it)"
+        )
+        with _store_errors(failed):
+            session = self._repository.writable_session(_BRANCH)
+            try:
+                group = zarr.open_group(session.store)
+                drives = checked_drives(_drives_of(group))
+                for index, tile in tiles:
+                    if not tile.is_empty:
+                        held = _read_tile(group, index)
+                        shifted = shift_heights(tile, shift_mm)
+                        _write_tile(group, index, combine_tiles(held, shifted, sign, index))
+                if drives:
+                    group.attrs["drives"] = _changed_drives(_drives_of(group), drives, sign)
+                    group.attrs["num_tiles"] = len(_listed(session))
+                if not session.has_uncommitted_changes:
+                    return session.snapshot_id
+                return session.commit(message, metadata={"drives": drives, "sign": sign})
+            except HDMapError:
+                session.discard_changes()
+                raise
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        with _store_errors(
+            f"The map at {self.path} is damaged or cannot be read; build it anew or take a copy"
+        ):
+            yield
 
     def _session(self) -> icechunk.Session:
         if self._version is None:
@@ -292,17 +345,61 @@ class SemanticMap:
         return zarr.open_group(self._session().store, mode="r")
 
 
+def is_semantic_map(path: Path) -> bool:
+    """Whether a folder is a map's repository and holds nothing else."""
+    if not path.is_dir():
+        return False
+    try:
+        found = {entry.name for entry in path.iterdir()}
+    except OSError:
+        return False
+    return found >= _REQUIRED_FOLDERS and found <= _KNOWN_FOLDERS
+
+
 def _icechunk() -> ModuleType:
-    """The library, told to keep to itself what its warnings say of every local store: one writer."""
+    """The library, told to keep its log to itself.
+
+    It warns at every local store, and on errors prints what it also raises.
+    """
     import icechunk
 
-    icechunk.set_logs_filter("error")
+    icechunk.set_logs_filter("off")
     return icechunk
 
 
-def is_semantic_map(path: Path) -> bool:
-    """Whether a folder looks like a map's repository."""
-    return path.is_dir() and (path / "refs").is_dir() and (path / "snapshots").is_dir()
+@contextmanager
+def _store_errors(what: str) -> Iterator[None]:
+    """Turn whatever the store's libraries raise into one line that starts with `what`."""
+    import icechunk
+    from zarr.errors import BaseZarrError
+
+    try:
+        yield
+    except HDMapError:
+        raise
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        BaseZarrError,
+        icechunk.IcechunkError,
+    ) as error:
+        raise StoreError(f"{what}: {_one_line(error)}.") from error
+
+
+def _listed(session: icechunk.Session) -> tuple[TileIndex, ...]:
+    """Tiles in a session's index; a height comes with every observation, so its chunks are the tiles."""
+    from zarr.core.sync import sync
+
+    async def listed() -> set[TileIndex]:
+        return {
+            (c[-1] - _HALF // TILE_CELLS, c[-2] - _HALF // TILE_CELLS)
+            async for c in session.chunk_coordinates("/height_n")
+        }
+
+    return tuple(sorted(sync(listed())))
 
 
 def _region(index: TileIndex) -> tuple[slice, slice]:
@@ -326,17 +423,22 @@ def _write_tile(group: zarr.Group, index: TileIndex, tile: Tile) -> None:
         array[..., rows, cols] = tile.layers[name]
 
 
-def _changed_drives(
-    held: dict[str, dict[str, Any]], changed: dict[str, dict[str, Any]], sign: int
-) -> dict[str, dict[str, Any]]:
+def _drives_of(group: zarr.Group) -> Drives:
+    return dict(group.attrs["drives"])  # type: ignore[arg-type]
+
+
+def _changed_drives(held: Drives, changed: Drives, sign: int) -> Drives:
+    result = dict(held)
     for drive_id, entry in changed.items():
-        frames = held.get(drive_id, {}).get("num_frames", 0) + sign * entry["num_frames"]
+        frames = result.get(drive_id, {}).get("num_frames", 0) + sign * entry["num_frames"]
         if frames > 0:
-            held[drive_id] = {"num_frames": frames}
+            result[drive_id] = {"num_frames": frames}
         else:
-            held.pop(drive_id, None)
-    return held
+            result.pop(drive_id, None)
+    return result
 
 
 def _one_line(error: BaseException) -> str:
-    return str(error).strip().split("\n")[0] or type(error).__name__
+    """The first words of a library's message, without its own decoration."""
+    first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    return first.strip().removeprefix("x ").strip().rstrip(".")[:200]

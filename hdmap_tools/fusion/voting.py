@@ -18,6 +18,9 @@ CountMode = Literal["majority", "share", "frame", "point"]
 SHARE_QUANTA: Final = 16
 """A frame's vote in mode ``share`` is split into so many whole parts, so that sums stay exact."""
 
+_OFFSET: Final = 2**30
+"""Beyond any cell's index, so that shifted indices are not negative."""
+
 
 def quanta_per_vote(mode: CountMode) -> int:
     """How many counts one frame's vote is worth."""
@@ -66,8 +69,11 @@ def cast_votes(
     if len(cells) == 0:
         empty = np.zeros(0, dtype=np.int64)
         return Votes(np.zeros((0, 2), dtype=np.int64), empty, empty)
-    unique_cells, cell_index = np.unique(cells, axis=0, return_inverse=True)
-    cell_index = cell_index.reshape(-1)
+    # Cells as single numbers: sorting rows is many times slower.
+    packed, cell_index = np.unique(
+        (cells[:, 0] + _OFFSET) * (2 * _OFFSET) + cells[:, 1] + _OFFSET, return_inverse=True
+    )
+    unique_cells = np.column_stack([packed // (2 * _OFFSET), packed % (2 * _OFFSET)]) - _OFFSET
     channels = labels.astype(np.int64) * num_bins + bins.astype(np.int64)
     # One row for each (cell, channel) with the number of points in it.
     span = int(channels.max()) + 1
@@ -88,8 +94,6 @@ def cast_votes(
         return Votes(
             unique_cells[cell[best_bin]], channel[best_bin], np.ones(len(best_bin), np.int64)
         )
-    _, group = np.unique(row_of_label[best_bin], return_index=True)
-    best_bin = best_bin[group]
     label_points = np.bincount(np.unique(row_of_label, return_inverse=True)[1], weights=points)
     label_chance = _hash(unique_cells[cell[best_bin]], label[best_bin], frame_key)
     winner = best_bin[_first_of_each(cell[best_bin], label_points, label_chance)]

@@ -1,8 +1,14 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hdmap_tools.association.ground import GroundedSweep
-from hdmap_tools.association.lookup import cell_centres_around, project_city, speaks_of_ground
+from hdmap_tools.association.lookup import (
+    cell_centres_around,
+    labels_at,
+    project_city,
+    speaks_of_ground,
+)
 from hdmap_tools.association.planar import associate_planar, ground_plane
 from hdmap_tools.association.sparse import associate_sparse
 from hdmap_tools.association.surface import associate_surface
@@ -13,6 +19,7 @@ from hdmap_tools.labels.label_set import Label, LabelSet, load_label_set
 from hdmap_tools.testing.street import Street, camera, distance_to_edge, flat, slope, stripes
 
 ADAS = load_label_set("adas-0001")
+MARK = 3
 CONFIG = AssociationConfig()
 BOX = (12.0, -1.5, 16.0, 1.5, 1.4)
 
@@ -25,20 +32,20 @@ def observe(
     method="sparse",
     config=CONFIG,
     cam=None,
-    lidar_height_m=1.9,
+    label_set=ADAS,
+    **lidar,
 ):
     pose = pose or SE3.identity()
     sweep_pose = sweep_pose or pose
     cam = cam or camera()
     labels = street.label_image(cam, pose)
-    grounded = GroundedSweep.from_sweep(
-        street.sweep(sweep_pose, lidar_height_m=lidar_height_m), sweep_pose, 60.0, 0.1
-    )
+    grounded = GroundedSweep.from_sweep(street.sweep(sweep_pose, **lidar), sweep_pose, 60.0, 0.1)
     if method == "sparse":
-        return associate_sparse(labels, ADAS, cam, pose, grounded, config)
+        return associate_sparse(labels, label_set, cam, pose, grounded, config)
     if method == "surface":
-        return associate_surface(labels, ADAS, cam, pose, grounded, 0.2, config)
-    return associate_planar(labels, ADAS, cam, pose, ground_plane(grounded), 0.2, config)
+        return associate_surface(labels, label_set, cam, pose, grounded, 0.2, config)
+    plane = ground_plane(grounded)
+    return associate_planar(labels, label_set, cam, pose, plane, sweep_pose, 0.2, config)
 
 
 def agreement(observations, margin_m=0.08):
@@ -190,3 +197,57 @@ def test_the_surface_carries_intensity_where_a_return_measured_it():
     expected = np.where(stripes(x, y) == 3, 90, 20)
     assert clear.sum() > 50
     assert (seen.intensity == expected)[clear].all()
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface", "planar"])
+def test_ground_beside_the_vehicle_is_not_used(method):
+    seen = observe(Street(flat, stripes), method=method, config=AssociationConfig(min_range_m=7.0))
+    distance = np.linalg.norm(seen.points_city[:, :2] - (1.7, 0.1), axis=1)
+    assert 7.0 <= distance.min() < 8.5
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface", "planar"])
+def test_a_tilted_vehicle_sees_the_same_street(method):
+    # Braking: 1.5 degrees of pitch and 1 of roll, and half a degree more 50 ms later.
+    def tilted(pitch_deg, roll_deg, x):
+        turn = Rotation.from_euler("yx", [pitch_deg, roll_deg], degrees=True).as_matrix()
+        return SE3(turn, np.array([x, 0.0, 0.0]))
+
+    seen = observe(
+        Street(flat, stripes),
+        pose=tilted(2.0, 1.0, 0.6),
+        sweep_pose=tilted(1.5, 1.0, 0.0),
+        method=method,
+    )
+    assert len(seen) > 400
+    assert agreement(seen) > 0.97
+    assert np.abs(np.median(seen.points_city[:, 2])) < 0.02
+    assert np.sqrt(np.mean(seen.points_city[:, 2] ** 2)) < 0.04
+
+
+@pytest.mark.parametrize("method", ["sparse", "surface", "planar"])
+def test_moving_objects_leave_no_votes(method):
+    # The street's marks become moving objects.
+    labels = tuple(label.model_copy(update={"moves": label.id == MARK}) for label in ADAS.labels)
+    moving = ADAS.model_copy(update={"labels": labels})
+    seen = observe(Street(flat, stripes), method=method, label_set=moving)
+    assert len(seen) > 300
+    assert MARK not in seen.labels
+
+
+def test_the_nearest_pixel_is_looked_up():
+    image = np.zeros((3, 4), dtype=np.uint8)
+    image[1, 2] = 7
+    assert labels_at(image, np.array([[1.6, 0.6], [2.4, 1.4], [1.4, 1.0]])).tolist() == [7, 7, 0]
+
+
+def test_something_close_behind_a_wall_is_hidden_and_something_before_it_is_not():
+    # Ground from 1 m behind the wall's back on is hidden; before the wall all is seen.
+    wall = (15.0, -6.0, 15.3, 6.0, 2.5)
+    for rings in (16, 32, 64):
+        street = Street(flat, stripes, wall)
+        seen = observe(street, method="surface", rings=rings)
+        x, y = seen.points_city[:, 0], seen.points_city[:, 1]
+        central = np.abs(y) < 4.0
+        assert ((x < 14.0) & central).sum() > 200
+        assert not ((x > 16.5) & central & (np.abs(y) < 0.3 * x)).any(), rings

@@ -164,10 +164,47 @@ def test_priors_above_one_are_refused():
 
 def test_confusion_without_a_matrix_is_refused():
     with pytest.raises(ConfigError, match=r"hdmap confusion.*--confusion"):
-        observation_model(ObservationConfig(), meta(), MAP_CLASSES, None)
+        observation_model(ObservationConfig(model="confusion"), meta(), MAP_CLASSES, None)
+
+
+def test_auto_believes_labels_alike_where_no_matrix_is_known(caplog):
+    auto = observation_model(ObservationConfig(), meta(), MAP_CLASSES, None)
+    vanilla = observation_model(ObservationConfig(model="vanilla"), meta(), MAP_CLASSES, None)
+    np.testing.assert_array_equal(auto.log_likelihood, vanilla.log_likelihood)
+    assert "No confusion matrix is known" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["vanilla", "confusion"])
+def test_classes_that_are_left_out_are_none_of_these(kind):
+    # A map of road and lane mark alone: what is labelled sidewalk is OTHER, not road.
+    matrix = ConfusionMatrix(CITYSCAPES, CITYSCAPES, 100 * np.eye(19, dtype=np.int64) + 1, "")
+    of = meta(label_set=CITYSCAPES)
+    model = observation_model(
+        ObservationConfig(model=kind), of, (MapClass.ROAD, MapClass.LANE_MARK), matrix
+    )
+    counts = np.zeros((19, 2, 1, 1), dtype=np.uint32)
+    counts[CITYSCAPES.id_of("sidewalk")] = 3 * 16
+    posterior = dict(zip(model.classes, model.posterior(counts)[:, 0, 0], strict=True))
+    assert posterior[OTHER] > 0.95
+    assert posterior["road"] < 0.05
+
+
+def test_labels_of_moving_objects_do_not_weigh_in_the_rows():
+    # Association never counts them, so a row must sum to 1 without them.
+    is_counted = np.array([not label.moves for label in CITYSCAPES.labels])
+    assert not is_counted.all()
+    counts = np.ones((19, 19), dtype=np.int64)
+    counts[CITYSCAPES.id_of("building"), CITYSCAPES.id_of("car")] = 10_000
+    matrix = ConfusionMatrix(CITYSCAPES, CITYSCAPES, counts, "")
+    for likelihood in (
+        confusion_likelihood(matrix, NAMES, 0.01)[0],
+        vanilla_likelihood(CITYSCAPES, NAMES, 0.1)[0],
+    ):
+        np.testing.assert_allclose(likelihood[:, is_counted].sum(axis=1), 1.0)
+        assert (likelihood > 0).all()
 
 
 def test_a_matrix_for_other_labels_is_refused():
     other = ConfusionMatrix(ADAS, CITYSCAPES, np.ones((4, 19), dtype=np.int64), "")
     with pytest.raises(LabelError, match=r"predicts 'cityscapes'.*counted 'adas-0001'"):
-        observation_model(ObservationConfig(), meta(), MAP_CLASSES, other)
+        observation_model(ObservationConfig(model="confusion"), meta(), MAP_CLASSES, other)

@@ -3,7 +3,7 @@ import pytest
 
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.config import ObservationConfig
-from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.cell_counts import TILE_CELLS, CellCounts
 from hdmap_tools.fusion.observation_model import observation_model
 from hdmap_tools.fusion.read_window import box_mean, read_window
 from hdmap_tools.geometry.grid import BevGrid
@@ -44,6 +44,32 @@ def test_layers_of_a_known_cell():
     assert window.layer("entropy")[1, 4] == pytest.approx(expected, abs=1e-6)
     assert float(window.dataset["x"][4]) == pytest.approx(0.9)
     assert float(window.dataset["y"][1]) == pytest.approx(0.3)
+
+
+def test_heights_count_from_the_reference():
+    counts = CellCounts(meta(reference_height_m=5.0))
+    counts.add(seen([(4, 1)], [1], z=6.5), 0)
+    window = read_window(counts, GRID, model(counts.meta))
+    assert window.layer("height")[1, 4] == pytest.approx(6.5)
+
+
+def test_reading_in_tiles_equals_reading_in_one_piece():
+    # Evidence around a corner of four tiles, and a tile that is only reached by filling.
+    corner = TILE_CELLS
+    cells = [(corner + dx, corner + dy) for dx, dy in [(-1, -1), (0, -1), (1, 1), (-3, 2)]]
+    counts = CellCounts(meta())
+    counts.add(seen([*cells, (2 * corner - 1, corner + 5)], [1, 3, 1, 0, 1]), 0)
+    grid = BevGrid(0.2, corner - 40, corner - 40, 2 * corner + 10, corner + 40)
+    for radius in (0, 1, 3):
+        got = read_window(counts, grid, model(counts.meta), radius)
+        layers = counts.window(grid.expand(radius)).layers
+        whole = model(counts.meta).posterior(layers["counts"])
+        if radius:
+            filled = model(counts.meta).posterior(box_mean(layers["counts"], radius))
+            whole = np.where(np.isnan(whole[0]), filled, whole)
+            whole = whole[:, radius:-radius, radius:-radius]
+        np.testing.assert_allclose(got.dataset["posterior"].values, whole, atol=1e-6)
+        assert got.is_known.sum() == np.isfinite(whole[0]).sum() > 0
 
 
 def test_unknown_stays_unknown_without_filling():

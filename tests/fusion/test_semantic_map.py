@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from hdmap_tools.errors import MapMismatchError, OutputExistsError, StoreError
-from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
 from hdmap_tools.geometry.grid import BevGrid
 
-from .builders import counts_of, frames_of, meta
+from .builders import counts_of, frames_of, meta, random_frame
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def test_what_is_stored_comes_back_exactly(stored):
     opened = SemanticMap.open(stored.path)
     assert opened.meta == meta()
     assert opened.read().equals(counts_of(frames_of(1, 3)))
-    assert opened.tiles() == tuple(sorted(counts_of(frames_of(1, 3)).tiles))
+    assert opened.tile_indices() == tuple(sorted(counts_of(frames_of(1, 3)).tiles))
     assert opened.drives == {"drive-1": {"num_frames": 3}}
 
 
@@ -72,7 +72,9 @@ def test_adding_the_same_drive_twice_by_merging_is_refused(stored, tmp_path):
 def test_subtracting_a_drive_that_is_not_there_is_refused(stored, tmp_path):
     other = SemanticMap.create(tmp_path / "other", meta())
     other.add(counts_of(frames_of(9, 1)), "drive-9")
-    with pytest.raises(MapMismatchError, match=r"does not hold drive-9.*it holds drive-1"):
+    with pytest.raises(
+        MapMismatchError, match=r"holds drive-9, which the map does not hold; the map holds drive-1"
+    ):
         stored.subtract(other)
 
 
@@ -95,18 +97,16 @@ def test_a_refused_subtraction_changes_nothing(stored, tmp_path):
     assert stored.read().equals(counts_of(frames_of(1, 3)))
 
 
-def test_an_existing_map_is_not_overwritten_unasked(stored):
-    with pytest.raises(OutputExistsError, match="--overwrite"):
+def test_an_existing_map_is_never_overwritten(stored):
+    with pytest.raises(OutputExistsError, match="exists already"):
         SemanticMap.create(stored.path, meta())
     assert SemanticMap.open(stored.path).drives
 
 
-def test_a_folder_that_is_no_map_is_never_overwritten(tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "one.jpg").write_bytes(b"x")
-    with pytest.raises(OutputExistsError, match="not a semantic map"):
-        SemanticMap.create(tmp_path / "photos", meta(), overwrite=True)
-    assert (tmp_path / "photos" / "one.jpg").exists()
+def test_what_has_other_things_in_it_is_no_map(stored):
+    assert is_semantic_map(stored.path)
+    (stored.path / "thesis.txt").write_text("x")
+    assert not is_semantic_map(stored.path)
 
 
 def test_opening_nothing_says_so(tmp_path):
@@ -114,11 +114,89 @@ def test_opening_nothing_says_so(tmp_path):
         SemanticMap.open(tmp_path / "none")
 
 
-def test_a_damaged_map_says_so(stored):
-    for file in (stored.path / "snapshots").iterdir():
-        file.write_bytes(b"not a snapshot")
+@pytest.mark.parametrize("part", ["snapshots", "refs"])
+def test_a_damaged_map_says_so(stored, part):
+    for file in (stored.path / part).rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"not what it was")
     with pytest.raises(StoreError, match="Cannot open the map"):
         SemanticMap.open(stored.path)
+
+
+def flip_a_byte(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) * 2 // 3] ^= 0x55
+    path.write_bytes(bytes(content))
+
+
+def error_of_reading(path, expected) -> str | None:
+    """What reading a map complains of; None if it gives what it should."""
+    try:
+        read = SemanticMap.open(path).read()
+    except StoreError as error:
+        return str(error)
+    assert read.equals(expected)
+    return None
+
+
+@pytest.mark.parametrize("harm", ["flip", "truncate", "empty", "delete"])
+@pytest.mark.parametrize("part", ["chunks", "manifests"])
+def test_damage_to_the_counts_is_found_never_read(tmp_path, part, harm):
+    stored = SemanticMap.create(tmp_path / "map", meta())
+    # Enough points that chunks become files; small ones lie inside the manifests.
+    dense = [(k, random_frame(np.random.default_rng(k), 3000, 12.0)) for k in range(2)]
+    stored.add(counts_of(dense), "drive-1")
+    expected = stored.read()
+    found = 0
+    for file in sorted((stored.path / part).rglob("*")):
+        if not file.is_file():
+            continue
+        content = file.read_bytes()
+        if harm == "flip":
+            flip_a_byte(file)
+        elif harm == "truncate":
+            file.write_bytes(content[: len(content) // 2])
+        elif harm == "empty":
+            file.write_bytes(b"")
+        else:
+            file.unlink()
+        said = error_of_reading(stored.path, expected)
+        if said is not None:
+            found += 1
+            assert str(stored.path) in said
+            assert "\n" not in said
+        file.write_bytes(content)
+    # Every chunk and manifest of the newest version is read, so its damage is found.
+    assert found > 0
+    assert SemanticMap.open(stored.path).read().equals(expected)
+
+
+def test_an_empty_map_adds_nothing_and_takes_nothing_out(stored, tmp_path):
+    empty = SemanticMap.create(tmp_path / "empty", meta())
+    versions = len(stored.history())
+    stored.merge(empty)
+    assert len(stored.history()) == versions
+    empty.merge(stored)
+    assert empty.read().equals(stored.read())
+
+
+def test_stored_maps_with_other_reference_heights_merge_exactly(tmp_path):
+    low = SemanticMap.create(tmp_path / "low", meta())
+    low.add(counts_of(frames_of(1, 2)), "drive-1")
+    high = SemanticMap.create(tmp_path / "high", meta(reference_height_m=7.0))
+    high.add(counts_of(frames_of(2, 2), meta(reference_height_m=7.0)), "drive-2")
+    low.merge(high)
+    assert low.read().equals(counts_of(frames_of(1, 2) + frames_of(2, 2)))
+
+
+def test_the_history_says_what_was_added(stored):
+    newest = stored.history()[0]
+    assert newest.metadata == {"drives": {"drive-1": {"num_frames": 3}}, "sign": 1}
+
+
+def test_a_window_of_another_resolution_is_refused(stored):
+    with pytest.raises(MapMismatchError, match=r"0\.1 m was asked of a map of 0\.2 m"):
+        stored.window(BevGrid(0.1, 0, 0, 5, 5))
 
 
 def test_a_newer_schema_is_refused(tmp_path):
@@ -135,7 +213,7 @@ def test_a_newer_schema_is_refused(tmp_path):
 
 def test_an_empty_map_has_no_grid(tmp_path):
     semantic_map = SemanticMap.create(tmp_path / "map", meta())
-    assert semantic_map.tiles() == ()
+    assert semantic_map.tile_indices() == ()
     assert semantic_map.grid is None
     assert np.array_equal(
         semantic_map.window(BevGrid(0.2, 0, 0, 3, 3)).layers["height_n"], np.zeros((3, 3))

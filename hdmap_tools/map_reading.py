@@ -1,0 +1,35 @@
+"""Reading a semantic map with the observation model that a configuration asks for."""
+
+from __future__ import annotations
+
+from hdmap_tools.config import Config
+from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.observation_model import ObservationModel, observation_model
+from hdmap_tools.fusion.read_window import read_window
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.geometry.grid import BevGrid
+from hdmap_tools.plugin_api import MapWindow
+from hdmap_tools.segmentation.confusion import ConfusionMatrix, find_confusion
+
+
+def model_for(meta: MapMeta, config: Config) -> ObservationModel:
+    """The observation model to read a map with.
+
+    Raises:
+        ConfigError, LabelError: As `observation_model`, and if the matrix cannot be read.
+    """
+    confusion = None
+    if config.observation.confusion is not None:
+        confusion = ConfusionMatrix.load(config.observation.confusion)
+    elif config.observation.model != "vanilla":
+        confusion = find_confusion(meta.label_set, meta.model)
+    return observation_model(config.observation, meta, config.classes, confusion)
+
+
+def whole_window(
+    source: SemanticMap | CellCounts, model: ObservationModel, config: Config
+) -> MapWindow:
+    """All of a map, read through an observation model; one cell where there is none."""
+    grid = source.grid or BevGrid(source.meta.resolution_m, 0, 0, 1, 1, source.meta.frame)
+    return read_window(source, grid, model, config.observation.fill_radius_cells)

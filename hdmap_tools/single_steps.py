@@ -1,0 +1,157 @@
+"""Steps of the pipeline on their own: build, vectorize, compare and merge."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hdmap_tools.compare.raster import RasterComparison, compare_raster
+from hdmap_tools.compare.reference import load_reference
+from hdmap_tools.config import Config
+from hdmap_tools.errors import OutputExistsError
+from hdmap_tools.formats.gpkg import write_gpkg
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.map_reading import model_for, whole_window
+from hdmap_tools.mapping import build_map, map_meta
+from hdmap_tools.output_folder import map_folder
+from hdmap_tools.pipeline import open_configured, open_for
+from hdmap_tools.segmentation.cache import LabelCache
+from hdmap_tools.segmentation.open_segmenter import open_segmenter
+from hdmap_tools.steps import Steps
+from hdmap_tools.vectorization import VectorizationResult, choose, vectorize
+from hdmap_tools.view.agreement import agreement_picture
+
+_LOG = logging.getLogger(__name__)
+
+
+def build_alone(
+    drive_path: Path,
+    out: Path,
+    config: Config,
+    *,
+    like: Path | None = None,
+    cache: LabelCache | None = None,
+    overwrite: bool = False,
+    steps: Steps | None = None,
+) -> dict[str, Any]:
+    """`build_map` into a place of its own: a new map that is whole or not there.
+
+    Args:
+        drive_path: Folder of the drive.
+        out: The map to make.
+        config: Every step's settings.
+        like: A map whose resolution, count mode, intensity threshold and reference
+            height are taken over, so that both can be merged.
+        cache: Where label images are kept between runs.
+        overwrite: Replace an earlier map.
+        steps: Told of progress.
+
+    Returns:
+        Drive, images used and dropped, tiles, seconds by step.
+    """
+    steps = steps or Steps()
+    with map_folder(out, overwrite) as folder:
+        with steps.timed("open"):
+            drive = open_for(config, drive_path)
+            segmenter = open_segmenter(config.segmentation, drive)
+            if like is not None:
+                model = SemanticMap.open(like).meta
+                config = settings_of(config, model)
+                threshold = model.intensity_threshold
+                map_meta(
+                    config, drive, segmenter.label_set, segmenter.name, threshold
+                ).require_compatible(model)
+        maps, counts = build_map(drive, segmenter, folder, config, cache, steps)
+        made = maps[config.association.method]
+        return {
+            "drive": drive.id,
+            "model": segmenter.name,
+            "intensity_threshold": made.meta.intensity_threshold,
+            "num_images": counts.used,
+            "num_images_dropped": dict(counts.dropped),
+            "num_tiles": len(made.tile_indices()),
+            "seconds": {name: round(value, 3) for name, value in steps.seconds.items()},
+        }
+
+
+def settings_of(config: Config, meta: MapMeta) -> Config:
+    """A configuration that builds maps which can be added to one with this meta."""
+    fusion = config.fusion.model_copy(
+        update={
+            "resolution_m": meta.resolution_m,
+            "count_mode": meta.count_mode,
+            "intensity_threshold": meta.intensity_threshold,
+            "reference_height_m": meta.reference_height_m,
+        }
+    )
+    return config.model_copy(update={"fusion": fusion})
+
+
+def vectorize_alone(
+    map_path: Path, out: Path, config: Config, *, overwrite: bool = False
+) -> VectorizationResult:
+    """Vectorize a semantic map into a GeoPackage."""
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists; use --overwrite to replace it.")
+    choose(config.vectorize)  # what is wrong with the plugins asked for is said before any work
+    semantic_map = SemanticMap.open(map_path)
+    window = whole_window(semantic_map, model_for(semantic_map.meta, config), config)
+    result = vectorize(window, config.vectorize)
+    write_gpkg(result.vector_map, out, overwrite=overwrite)
+    return result
+
+
+def compare_alone(
+    map_path: Path,
+    reference_path: Path,
+    config: Config,
+    *,
+    drive_path: Path | None = None,
+    picture: Path | None = None,
+    overwrite: bool = False,
+) -> RasterComparison:
+    """Hold a semantic map against a reference; near the driven path if the drive is given."""
+    semantic_map = SemanticMap.open(map_path)
+    window = whole_window(semantic_map, model_for(semantic_map.meta, config), config)
+    reference = load_reference(reference_path, window.grid)
+    path_xy = None
+    if drive_path is not None:
+        drive = open_configured(config, drive_path)
+        if drive.frame.is_georeferenced:
+            drive.frame.require_same(semantic_map.meta.frame)
+        else:
+            _LOG.info(
+                "Drive %s does not know its place; its poses are taken in the map's frame.",
+                drive.name,
+            )
+        path_xy = drive.trajectory.translations[:, :2]
+    comparison = compare_raster(
+        window,
+        reference,
+        path_xy=path_xy,
+        max_range_m=config.compare.max_range_m if path_xy is not None else None,
+        count_filled=config.compare.count_filled,
+    )
+    if picture is not None:
+        agreement_picture(
+            window, reference, comparison, picture, trajectory_xy=path_xy, overwrite=overwrite
+        )
+    return comparison
+
+
+def merge_maps(
+    maps: Sequence[Path], subtract: Sequence[Path], out: Path, *, overwrite: bool = False
+) -> SemanticMap:
+    """Add maps into a new one, and take others out of the sum."""
+    opened = [SemanticMap.open(path) for path in maps]
+    taken = [SemanticMap.open(path) for path in subtract]
+    with map_folder(out, overwrite) as folder:
+        merged = SemanticMap.create(folder, opened[0].meta)
+        for path, one in zip(maps, opened, strict=True):
+            merged.merge(one, str(path))
+        for path, one in zip(subtract, taken, strict=True):
+            merged.subtract(one, str(path))
+    return SemanticMap.open(out)
