@@ -3,8 +3,12 @@
 Run as a script it writes the generated parts anew.
 """
 
+import ast
 import dataclasses
+import importlib.util
+import os
 import re
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -23,7 +27,8 @@ from hdmap_tools.testing.fake_plugins import FakePlugins
 from hdmap_tools.testing.scenes import street_scene
 from hdmap_tools.vectorization import vectorize
 
-README = Path(__file__).resolve().parents[2] / "plugins" / "README.md"
+REPOSITORY = Path(__file__).resolve().parents[2]
+README = REPOSITORY / "plugins" / "README.md"
 OURS = "hdmap-tools"
 GENERATED = re.compile(r"(<!-- generated: (\w+)[^>]*-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
@@ -145,21 +150,25 @@ def test_every_element_type_is_part_of_the_api() -> None:
 # The example
 
 
-@pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The example's files, installed beside whatever is installed here."""
-    sources = blocks("python")
-    for source in sources:
+def write_example(folder: Path) -> None:
+    """Every file that the text shows."""
+    for source in blocks("python"):
         name = re.match(r"# (\w+\.py)\n", source)
         assert name, "a python block begins with a comment that names its file"
-        (tmp_path / name[1]).write_text(source, encoding="utf-8")
+        (folder / name[1]).write_text(source, encoding="utf-8")
     (toml,) = blocks("toml")
-    document = tomllib.loads(toml)["project"]
+    (folder / "pyproject.toml").write_text(toml, encoding="utf-8")
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The example's files, registered as its pyproject.toml says, beside what is installed here."""
+    write_example(tmp_path)
+    document = tomllib.loads((tmp_path / "pyproject.toml").read_text("utf-8"))["project"]
     lines = [f"{k} = {v}" for k, v in document["entry-points"][ENTRY_POINT_GROUP].items()]
-    beside = "sidewalk_beside_crosswalks = my_sidewalks_beside_crosswalks:SidewalkBesideCrosswalks"
     made = FakePlugins(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    made.register(document["name"], [*lines, beside], version=document["version"])
+    made.register(document["name"], lines, version=document["version"])
     for module in tmp_path.glob("*.py"):
         monkeypatch.delitem(sys.modules, module.stem, raising=False)
     return tmp_path
@@ -186,6 +195,67 @@ def test_the_examples_own_tests_pass(project: Path) -> None:
                 ran.append(f"{name}.{method}")
     checks = len(conformance.REQUIRED_CHECKS) + len(conformance.ADVISORY_CHECKS)
     assert len(ran) == 2 * checks + 1
+
+
+def test_the_example_followed_to_the_letter_passes(tmp_path: Path) -> None:
+    """Its files as they stand, built, installed and tested in a process of their own; no network."""
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    write_example(source)
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps"]
+    install += ["--no-build-isolation", "--disable-pip-version-check", "--target", str(site)]
+    done = subprocess.run([*install, str(source)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # The tests alone: the modules must come from what was installed.
+    tests = tmp_path / "tests"
+    tests.mkdir()
+    (source / "test_my_sidewalks.py").rename(tests / "test_my_sidewalks.py")
+    path = os.pathsep.join(x for x in (str(site), os.environ.get("PYTHONPATH")) if x)
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tests)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tests,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_how_to_install_is_said_as_it_is() -> None:
+    example = REPOSITORY / "examples" / "third_party_vectorizer" / "README.md"
+    for document in (text(), example.read_text(encoding="utf-8")):
+        steps = re.findall(r"^    (pip install .*)$", document, re.MULTILINE)
+        # From a checkout: no index has it.
+        assert steps[:2] == ["pip install -e path/to/hdmap-tools", "pip install pytest"]
+
+
+def imports_of(path: Path) -> set[str]:
+    """Modules of the core that a file imports."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found = {node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return {name for name in found if name.split(".")[0] == "hdmap_tools"}
+
+
+def test_plugins_import_only_what_is_documented() -> None:
+    section = text().partition("A plugin may import these modules")[2].partition("\nEverything")[0]
+    modules = re.findall(r"^\| `(hdmap_tools\.\w+)` \|", section, re.MULTILINE)
+    assert len(modules) == 4
+    assert [name for name in modules if importlib.util.find_spec(name) is None] == []
+    outside = REPOSITORY / "examples" / "third_party_vectorizer"
+    for path in [*(REPOSITORY / "plugins").rglob("*.py"), *outside.rglob("*.py")]:
+        # The tests of a plugin are the only place for hdmap_tools.testing.
+        is_test = path.is_relative_to(outside / "tests")
+        allowed = [m for m in modules if is_test or m != "hdmap_tools.testing"]
+        strange = [
+            name
+            for name in sorted(imports_of(path))
+            if not any(name == m or name.startswith(f"{m}.") for m in allowed)
+        ]
+        assert strange == [], path
 
 
 def test_the_configuration_shown_runs_it(project: Path) -> None:
