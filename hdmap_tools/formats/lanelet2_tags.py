@@ -71,7 +71,9 @@ def line_tags(element: MapElement) -> dict[str, str] | None:
     """Tags of a line element, or None if Lanelet2 has no line for it."""
     own: dict[str, str]
     if isinstance(element, LaneMark):
-        is_thick = element.width_m is not None and element.width_m >= THICK_LINE_M
+        is_thick = element.is_thick
+        if is_thick is None:
+            is_thick = _is_thick_by_width(element.width_m)
         own = {"type": "line_thick" if is_thick else "line_thin"}
         if element.style is not MarkStyle.UNKNOWN:
             own["subtype"] = element.style.value
@@ -100,14 +102,18 @@ def line_fields(tags: Mapping[str, str]) -> tuple[type[MapElement], dict[str, An
         known = subtype in set(MarkStyle)
         color = tags.get("color", "")
         changed = f"{kind} {subtype}".strip() if not known and subtype else ""
+        width_m, is_thick = _width(tags), None
         if kind.endswith("_marking"):
             changed = kind
+        elif (kind == "line_thick") != _is_thick_by_width(width_m):
+            is_thick = kind == "line_thick"
         return (
             LaneMark,
             {
                 "style": subtype if known else MarkStyle.UNKNOWN,
                 "color": color if color in set(MarkColor) else MarkColor.UNKNOWN,
-                "width_m": _width(tags),
+                "width_m": width_m,
+                "is_thick": is_thick,
             },
             changed,
         )
@@ -139,3 +145,7 @@ def _width(tags: Mapping[str, str]) -> float | None:
     except ValueError:
         return None
     return width_m if 0.0 < width_m < float("inf") else None
+
+
+def _is_thick_by_width(width_m: float | None) -> bool:
+    return width_m is not None and width_m >= THICK_LINE_M

@@ -85,13 +85,21 @@ class MarkColor(StrEnum):
 
 
 class LaneMark(MapElement):
-    """A painted line along the lane; the geometry is the centre of the paint."""
+    """A painted line along the lane; the geometry is the centre of the paint.
+
+    Attributes:
+        style, color: As painted.
+        width_m: Of the paint, where it is known.
+        is_thick: Whether the map it was read from calls it a thick line, where that does not
+            follow from the width; None where it does.
+    """
 
     element_type: ClassVar[str] = "lane_mark"
 
     style: MarkStyle = MarkStyle.UNKNOWN
     color: MarkColor = MarkColor.UNKNOWN
     width_m: Annotated[float, Field(gt=0.0)] | None = None
+    is_thick: bool | None = None
 
 
 class BoundaryKind(StrEnum):

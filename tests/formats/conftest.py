@@ -79,6 +79,8 @@ def elements() -> tuple[MapElement, ...]:
         left,
         LaneMark(id="wide", geometry=line((0, 9), (5, 9)), style="solid_dashed", width_m=0.25),
         LaneMark(id="plain", geometry=line((0, 10), (5, 10))),
+        LaneMark(id="thick", geometry=line((0, 11), (5, 11)), is_thick=True),
+        LaneMark(id="thin", geometry=line((0, 11.5), (5, 11.5)), width_m=0.3, is_thick=False),
         RoadBoundary(
             id="island", geometry=line(*circle, circle[0]), kind="unknown", is_island=True
         ),

@@ -1,6 +1,7 @@
 """Round trips and rules of the Lanelet2 files; the library judges them in test_lanelet2_library."""
 
 import random
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from hdmap_tools.errors import FormatError, NoOriginError, OutputExistsError
 from hdmap_tools.formats import lanelet2_write
 from hdmap_tools.formats.lanelet2 import read_lanelet2, to_osm, write_lanelet2
 from hdmap_tools.formats.lanelet2_geometry import are_reversed, split_crosswalk
+from hdmap_tools.formats.lanelet2_tags import line_fields, line_tags
 from hdmap_tools.formats.osm_document import require_valid_lanelet2
 from hdmap_tools.formats.osm_xml import read_osm
 from hdmap_tools.geometry.map_frame import MapFrame
@@ -103,6 +105,48 @@ def test_file_keeps_the_rules(vector_map: VectorMap, tmp_path: Path) -> None:
 
 
 _PRIMITIVES = ("<node", "<way ", "<rela")
+
+
+@pytest.mark.parametrize(
+    ("kind", "width", "is_thick"),
+    [
+        ("line_thick", "", True),
+        ("line_thin", "", None),
+        ("line_thick", "0.25", None),
+        ("line_thin", "0.12", None),
+        ("line_thick", "0.12", True),
+        ("line_thin", "0.25", False),
+    ],
+)
+def test_thick_and_thin_are_kept_as_they_were(kind: str, width: str, is_thick: bool | None) -> None:
+    tags = {"type": kind, "subtype": "dashed"} | ({"width": width} if width else {})
+    found = line_fields(tags)
+    assert found is not None
+    element_type, fields, changed = found
+    assert (element_type, fields["is_thick"], changed) == (LaneMark, is_thick, "")
+    mark = element_type(id="m", geometry=LineString([(0, 0, 0), (1, 0, 0)]), **fields)
+    assert line_tags(mark) == {"hdmap_id": "m", **tags}
+
+
+@pytest.mark.realdata
+def test_a_real_map_keeps_its_kinds_of_line(data_root: Path, tmp_path: Path) -> None:
+    source = data_root / "lanelet2" / "mapping_example.osm"
+    write_lanelet2(read_lanelet2(source), tmp_path / "copy.osm")
+
+    def kinds(path: Path) -> Counter[tuple[str, str | None]]:
+        ways = read_osm(path).ways.values()
+        return Counter(
+            (w.tags["type"], w.tags.get("subtype"))
+            for w in ways
+            if w.tags.get("type") in ("line_thick", "line_thin")
+        )
+
+    before, after = kinds(source), kinds(tmp_path / "copy.osm")
+    assert before["line_thick", "dashed"] == 50
+    # Bike marks, which we know no type for, become thin lines without more.
+    assert {k: after[k] for k in before if k[0] == "line_thick"} == {
+        k: n for k, n in before.items() if k[0] == "line_thick"
+    }
 
 
 def test_centerline_that_is_not_the_middle_is_kept(frame: MapFrame, tmp_path: Path) -> None:
