@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, Protocol
@@ -18,6 +19,10 @@ from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.segmentation.label_png import read_label_png, read_panoptic_png
 from hdmap_tools.types import NDArrayByte
 
+_LOG = logging.getLogger(__name__)
+
+_BY_CHANCE: Final = 0.01
+"""IoU that masks read with the wrong labels reach here and there."""
 _IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png")
 
 
@@ -61,6 +66,16 @@ def measure_confusion(
         total = one if total is None else total + one
     if total is None:
         raise ConfigError("There is no annotated image to measure a confusion matrix on.")
+    agreed = total.class_agreement()
+    if not any(one.iou >= _BY_CHANCE for one in agreed.values()):
+        _LOG.warning(
+            "Network (%s) and masks (%s) agree on no class of the map (%s); is %r what the ids in the "
+            "masks mean?",
+            predicted_set.name,
+            true_set.name,
+            ", ".join(f"{name} IoU {one.iou:.3f}" for name, one in agreed.items()) or "none shared",
+            true_set.name,
+        )
     return ConfusionMatrix(true_set, predicted_set, total.counts, source)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hdmap_tools.errors import ConfigError, ImageError, LabelError
+from hdmap_tools.labels.label_set import load_label_set
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.segmentation.measure_confusion import (
     confusion_from_folders,
@@ -97,3 +98,21 @@ def test_masks_that_do_not_fit(tmp_path, folder, segmenter, label_set):
     (folder / "b.png").write_bytes(b"")
     with pytest.raises(ImageError, match=r"b\.png"):
         confusion_from_folders(folder, folder, segmenter, label_set, mask_suffix="_mask")
+
+
+def test_masks_of_another_label_set_are_warned_of(caplog):
+    label_set = load_label_set("adas-0001")  # 1 is road, 2 kerb
+    image, truth = np.zeros((8, 8, 3), np.uint8), np.full((8, 8), 1, np.uint8)
+
+    def measured(predicted):
+        caplog.clear()
+        measure_confusion([(image, truth)], lambda _: predicted, label_set, label_set)
+        return caplog.text
+
+    assert measured(truth) == ""
+    partly = truth.copy()
+    partly[:7] = 0
+    assert measured(partly) == ""
+    said = measured(np.full((8, 8), 2, np.uint8))
+    assert "agree on no class of the map" in said
+    assert "is 'adas-0001' what the ids in the masks mean?" in said
