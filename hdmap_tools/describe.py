@@ -71,7 +71,7 @@ def _describe_drive(
 
 def _describe_semantic_map(path: Path) -> dict[str, Any]:
     semantic_map = SemanticMap.open(path)
-    meta, tiles = semantic_map.meta, semantic_map.tiles()
+    meta, tiles = semantic_map.meta, semantic_map.tile_indices()
     tile_m2 = (TILE_CELLS * meta.resolution_m) ** 2
     return {
         "kind": "semantic map",

@@ -40,7 +40,7 @@ def command(**given: Any) -> None:
         raise click.UsageError(
             "--max-range counts from the driven path: give the drive too, with --drive."
         )
-    from hdmap_tools.pipeline import compare_alone
+    from hdmap_tools.single_steps import compare_alone
 
     config = options.resolve_config(given)
     comparison = compare_alone(
@@ -51,7 +51,7 @@ def command(**given: Any) -> None:
         picture=given["picture"],
         overwrite=given["overwrite"],
     )
-    options.write_json(given["json_path"], comparison.to_json())
+    options.write_json(given["json_path"], comparison.to_json(), overwrite=given["overwrite"])
     click.echo(
         f"{comparison.num_cells} cells ({comparison.area_m2:.0f} m2) against {comparison.reference}"
     )

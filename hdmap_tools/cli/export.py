@@ -49,7 +49,11 @@ def command(**given: Any) -> None:
         vector_map = replace(vector_map, frame=MapFrame.from_origin(lat, lon, alt))
     write_vector_map(vector_map, given["out"], format_name, overwrite=given["overwrite"])
     counts = vector_map.counts()
-    options.write_json(given["json_path"], {"format": format_name, "num_elements": counts})
+    options.write_json(
+        given["json_path"],
+        {"format": format_name, "num_elements": counts},
+        overwrite=given["overwrite"],
+    )
     click.echo(
         f"{', '.join(f'{n} {name}' for name, n in counts.items()) or 'No elements'} in {given['out']}"
     )

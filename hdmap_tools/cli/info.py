@@ -15,6 +15,7 @@ from hdmap_tools.cli import options
 @click.argument("path", type=options.PATH, required=False)
 @options.drive_options
 @click.option("--default-config", is_flag=True, help="Print hdmap.yaml with all defaults instead.")
+@options.overwrite_option
 @options.json_option
 def command(path: Path | None, **given: Any) -> None:
     """Say what a drive, a semantic map or a vector file holds.
@@ -36,7 +37,7 @@ def command(path: Path | None, **given: Any) -> None:
     if path is None:
         raise click.UsageError("Give a PATH, or --default-config.")
     facts = describe(path, given["layout"] or "auto", given["scene"], given["cameras"])
-    options.write_json(given["json_path"], facts)
+    options.write_json(given["json_path"], facts, overwrite=given["overwrite"])
     _show(facts)
 
 

@@ -21,8 +21,9 @@ def command() -> None:
 
 
 @command.command("list")
+@options.overwrite_option
 @options.json_option
-def list_plugins(json_path: Path | None) -> None:
+def list_plugins(json_path: Path | None, overwrite: bool) -> None:
     """List installed vectorizers: name, version, distribution, status.
 
     \b
@@ -44,7 +45,7 @@ def list_plugins(json_path: Path | None) -> None:
                 "reason": status.reason,
             }
         )
-    options.write_json(json_path, rows)
+    options.write_json(json_path, rows, overwrite=overwrite)
     if not rows:
         click.echo("No vectorizers are installed.")
         return
@@ -87,8 +88,9 @@ def info(name: str) -> None:
 
 @command.command("check")
 @click.argument("name")
+@options.overwrite_option
 @options.json_option
-def check(name: str, json_path: Path | None) -> int:
+def check(name: str, json_path: Path | None, overwrite: bool) -> int:
     """Run the conformance checks on an installed vectorizer.
 
     \b
@@ -112,6 +114,7 @@ def check(name: str, json_path: Path | None) -> int:
             }
             for r in results
         ],
+        overwrite=overwrite,
     )
     for result in results:
         word = "ok  " if result.passed else ("FAIL" if result.is_required else "note")

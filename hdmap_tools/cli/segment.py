@@ -48,7 +48,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             overwrite=given["overwrite"],
             progress=segmented,
         )
-    options.write_json(given["json_path"], report)
+    options.write_json(given["json_path"], report, overwrite=given["overwrite"])
     shares = ", ".join(f"{name} {share:.1%}" for name, share in report["pixel_share"].items())
     click.echo(
         f"{report['num_images']} label images of {segmenter.name} ({segmenter.label_set.name}) in "

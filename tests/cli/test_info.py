@@ -132,3 +132,13 @@ def test_a_map_that_cannot_be_read_yet_is_marked(street, hdmap, monkeypatch):
     listed = [line.strip() for line in out.splitlines() if str(street) in line]
     marked = [line.endswith(" (not readable yet)") for line in listed]
     assert marked == [True, False, False, True]
+
+
+def test_a_json_file_that_exists_is_replaced_when_asked(mark, hdmap, fails, tmp_path):
+    write_vector_map(VectorMap(MapFrame(), (mark,)), tmp_path / "m.gpkg")
+    for command in (("info", tmp_path / "m.gpkg"), ("plugins", "list")):
+        (tmp_path / "f.json").write_text("something else")
+        fails(*command, "--json", tmp_path / "f.json", says=("f.json", "--overwrite"))
+        code, _, err = hdmap(*command, "--json", tmp_path / "f.json", "--overwrite")
+        assert code == 0, err
+        assert json.loads((tmp_path / "f.json").read_text())
