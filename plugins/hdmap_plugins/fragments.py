@@ -19,11 +19,12 @@ def lengths_with_company(lines: list[NDArrayFloat], heading_length: float) -> ND
     """Length (N,) of each line together with those that go on with it.
 
     One line goes on with another when it starts where that one ends: in its direction,
-    beyond a gap no longer than either of them.
+    beyond a gap no longer than either of them. A line too short to tell where it
+    points goes on with none.
 
     Args:
         lines: Directed open lines, each (K, 2).
-        heading_length: How much of a line, at most, tells where its end points; unit of the lines.
+        heading_length: How much of a line tells where its end points; unit of the lines.
     """
     lengths = np.array([float(arc_lengths(line)[-1]) for line in lines])
     if len(lines) < 2:
@@ -40,6 +41,8 @@ def lengths_with_company(lines: list[NDArrayFloat], heading_length: float) -> ND
     for heading in (leaving[:, None], entering[None, :]):
         # Over next to no gap the way across has no direction.
         goes_on &= np.sum(gap * heading, axis=-1) >= least * gap_length - 1.0e-9
+    has_heading = lengths >= heading_length
+    goes_on &= has_heading[:, None] & has_heading[None, :]
     np.fill_diagonal(goes_on, False)
     _, group = connected_components(coo_array(goes_on), directed=False)
     return np.asarray(np.bincount(group, weights=lengths)[group])

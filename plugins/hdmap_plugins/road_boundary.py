@@ -50,7 +50,8 @@ class RoadBoundaryOptions(VectorizerOptions):
         min_road_area_m2: Smaller drivable patches are dropped as specks.
         min_island_area_m2: Smaller islands in the road are dropped as specks.
         min_length_m: Shorter open lines are dropped, unless others go on with them:
-            pieces of one boundary, with gaps no longer than they are, count together.
+            pieces of one boundary, each of a metre or more, with gaps no longer than
+            they are, count together.
             Heights and smoothing need about as much line to say anything.
         min_confidence: Lines that are less sure are dropped: as likely as not, the road
             does not end there.

@@ -24,7 +24,8 @@ FIRST = line((0, 0), (2, 0))
         (line((2, 0), (5, 0)), True),  # without a gap
         (line((3, 0.5), (5, 1.5)), True),  # a bend
         (line((4.5, 0), (6.5, 0)), False),  # the gap is longer than either
-        (line((2.8, 0), (3.3, 0)), False),  # longer than the second
+        (line((3.5, 0), (4.7, 0)), False),  # longer than the second
+        (line((2.1, 0), (2.9, 0)), False),  # too short to point anywhere
         (line((5, 0), (3, 0)), False),  # the other way round: road on its other side
         (line((2.5, 0), (2.5, 3)), False),  # a corner
         (line((2, 1), (4, 1)), False),  # beside it
