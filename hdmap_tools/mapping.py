@@ -26,6 +26,7 @@ from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
+from hdmap_tools.opening import require_images
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.segmenter import Segmenter
@@ -56,15 +57,6 @@ class FrameCounts:
     used: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
     observations: Counter[str] = field(default_factory=Counter)
-
-
-def require_images(drive: Drive) -> None:
-    """Raise `DriveError` if a drive has nothing to segment."""
-    if not drive.images:
-        raise DriveError(
-            f"Drive {drive.name} has no images, so there is nothing to segment. Expected images of "
-            f"{', '.join(drive.cameras) or 'a calibrated camera'} in {drive.root}."
-        )
 
 
 class FrameSource:

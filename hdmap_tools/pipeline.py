@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,17 +12,16 @@ import numpy as np
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import Reference, load_reference
 from hdmap_tools.config import Config
-from hdmap_tools.errors import ConfigError, FormatError
+from hdmap_tools.errors import FormatError
 from hdmap_tools.formats.by_name import write_vector_map
 from hdmap_tools.formats.gpkg import write_gpkg
-from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_reading import model_for, whole_window
-from hdmap_tools.mapping import build_map, map_meta, require_images
+from hdmap_tools.mapping import build_map, map_meta
+from hdmap_tools.opening import open_for
 from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.plugin_api import MapWindow
 from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.readers.image import read_image
-from hdmap_tools.readers.open_drive import open_drive
 from hdmap_tools.run_metrics import RunMetrics, versions
 from hdmap_tools.segmentation.cache import LabelCache
 from hdmap_tools.segmentation.open_segmenter import find_model, open_segmenter
@@ -136,28 +135,6 @@ def run(
         (folder / METRICS_NAME).write_text(metrics.to_json(), encoding="utf-8")
         (folder / CONFIG_NAME).write_text(config.to_yaml(), encoding="utf-8")
     return RunResult(metrics, result.failures)
-
-
-def open_configured(config: Config, drive_path: Path) -> Drive:
-    """Open a drive as configured."""
-    wanted = config.drive
-    return open_drive(drive_path, wanted.layout, wanted.scene, wanted.cameras)
-
-
-def open_for(config: Config, drive_path: Path) -> Drive:
-    """Open a drive to be mapped: it has images, and its place on earth is settled."""
-    drive = open_configured(config, drive_path)
-    require_images(drive)
-    origin = config.export.origin
-    if origin is not None and drive.frame.is_georeferenced:
-        raise ConfigError(
-            f"Drive {drive.name} knows its place on earth ({drive.frame.describe()}); leave --origin out."
-        )
-    if origin is not None:
-        drive = replace(drive, frame=MapFrame.from_origin(*origin))
-    if config.export.formats and not drive.frame.is_georeferenced:
-        _ = drive.frame.crs  # raises NoOriginError before hours of work, not after
-    return drive
 
 
 def export(vector_map: VectorMap, folder: Path, config: Config) -> None:

@@ -16,8 +16,8 @@ from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import build_map, map_meta
+from hdmap_tools.opening import open_configured, open_for
 from hdmap_tools.output_folder import map_folder
-from hdmap_tools.pipeline import open_configured, open_for
 from hdmap_tools.segmentation.cache import LabelCache
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.steps import Steps

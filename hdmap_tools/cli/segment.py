@@ -30,8 +30,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     mean) and OUT/model.json (what made them).
     """
     from hdmap_tools.label_folder import write_label_folder
-    from hdmap_tools.mapping import require_images
-    from hdmap_tools.pipeline import open_configured
+    from hdmap_tools.opening import open_configured, require_images
     from hdmap_tools.segmentation.open_segmenter import open_segmenter
 
     config = options.resolve_config(given)

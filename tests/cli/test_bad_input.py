@@ -180,7 +180,7 @@ def test_a_failing_run_leaves_the_good_result_in_place(street, hdmap, fails):
     sweep.write_bytes(b"short")
     fails("run", "drive", "-o", "first", "--overwrite", *LABELS, says=(sweep.name,))
     assert (street / "first" / "lanelet2_map.osm").read_bytes() == before
-    assert SemanticMap.open(street / "first" / "semantic_map").tiles()
+    assert SemanticMap.open(street / "first" / "semantic_map").tile_indices()
 
 
 def test_overwriting_never_touches_a_folder_that_is_no_result(street, fails):

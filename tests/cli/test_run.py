@@ -16,6 +16,7 @@ from hdmap_tools.readers.open_drive import open_drive
 from .conftest import LABELS
 
 OUTPUTS = {
+    ".hdmap-result.json",
     "agreement.png",
     "features.gpkg",
     "hdmap.yaml",
@@ -158,7 +159,7 @@ def test_two_halves_merge_to_the_whole(street, hdmap):
 def test_a_relative_output_in_a_new_folder(street, hdmap):
     code, _, err = hdmap("build", "drive", "-o", "deep/down/map", *LABELS)
     assert code == 0, err
-    assert SemanticMap.open(street / "deep" / "down" / "map").tiles()
+    assert SemanticMap.open(street / "deep" / "down" / "map").tile_indices()
 
 
 def test_a_run_without_lidar_by_plane(street, hdmap):
