@@ -210,6 +210,7 @@ def test_run_metrics_validate() -> None:
         intensity_threshold=31,
         num_images=6,
         num_images_dropped={"no pose": 1},
+        num_observations={"FRONT": 900},
         num_tiles=4,
         num_elements={"lane_mark": 12},
         plugins=[{"name": "lane_mark_skeleton", "version": "0.1.0", "options": {}}],

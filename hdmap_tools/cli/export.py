@@ -37,6 +37,7 @@ def command(**given: Any) -> None:
     from hdmap_tools.formats.by_name import output_format, read_vector_map, write_vector_map
     from hdmap_tools.geometry.map_frame import MapFrame
 
+    options.require_free_json(given["json_path"], given["overwrite"])
     format_name = output_format(given["out"], given["format_name"])
     vector_map = read_vector_map(given["vector_map"])
     if given["origin"] is not None:

@@ -54,7 +54,10 @@ def segmentation_options(function: F) -> F:
             "--no-cache", is_flag=True, help="Neither use nor keep label images of earlier runs."
         ),
         click.option("--cache", "cache_folder", type=PATH, help="Folder for kept label images."),
-        click.option("--label-set", help="What the ids in those PNGs mean: a name or a JSON file."),
+        click.option(
+            "--label-set",
+            help="What the ids in those PNGs mean: a name or a JSON file [default: label_set.json there].",
+        ),
         click.option(
             "--labels", type=PATH, help="Folder of label PNGs, CAMERA/TIMESTAMP_NS.png, instead."
         ),
@@ -158,11 +161,9 @@ def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
     import yaml
 
     from hdmap_tools.config import load_config
-    from hdmap_tools.errors import ConfigError, OutputExistsError
+    from hdmap_tools.errors import ConfigError
 
-    json_path = given.get("json_path")
-    if json_path is not None and json_path.exists() and not given.get("overwrite"):
-        raise OutputExistsError(f"{json_path} exists; use --overwrite to replace it.")
+    require_free_json(given["json_path"], given["overwrite"])
     dotted: dict[str, Any] = {}
     for setting in given["settings"]:
         name, equals, value = setting.partition("=")
@@ -249,6 +250,18 @@ class ImageProgress:
 
     def _told(self, done: int, total: int) -> None:
         self._progress.update(self._task, completed=done, total=total)
+
+
+def require_free_json(path: Path | None, overwrite: bool) -> None:
+    """Refuse a --json file that exists before the work, not after it.
+
+    Raises:
+        OutputExistsError: If there is a file and overwrite is False: it may be anything.
+    """
+    from hdmap_tools.errors import OutputExistsError
+
+    if path is not None and path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists; use --overwrite to replace it.")
 
 
 def write_json(path: Path | None, document: Any, overwrite: bool = False) -> None:
