@@ -25,6 +25,16 @@
 A message says what was found, what was expected and what to do.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+_MAX_PROBLEMS: Final = 3
+_MAX_CHARACTERS: Final = 160
+
 
 class HDMapError(Exception):
     """Root of all errors raised on purpose by this package."""
@@ -108,3 +118,17 @@ class OutputExistsError(HDMapError, FileExistsError):
 
 class MissingExtraError(HDMapError, ImportError):
     """An optional dependency is needed and not installed."""
+
+
+def brief_problems(error: ValidationError) -> str:
+    """At most three problems of a document as ``field: problem``, on one line, for a message."""
+    details = error.errors(include_url=False, include_context=False, include_input=False)
+    lines = []
+    for detail in details[:_MAX_PROBLEMS]:
+        where = ".".join(str(part) for part in detail["loc"]) or "document"
+        line = f"{where}: {detail['msg'].removeprefix('Value error, ')}"
+        line = line if line.isprintable() else ascii(line)  # names of fields come from the file
+        lines.append(line if len(line) <= _MAX_CHARACTERS else line[: _MAX_CHARACTERS - 3] + "...")
+    if num_more := len(details) - len(lines):
+        lines.append(f"and {num_more} more")
+    return "; ".join(lines)

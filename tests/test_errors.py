@@ -5,6 +5,7 @@ import inspect
 import re
 
 import pytest
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hdmap_tools import errors
 from hdmap_tools.errors import HDMapError
@@ -56,3 +57,18 @@ def test_all_are_caught_by_the_root_and_keep_their_message(name: str) -> None:
         raise CLASSES[name]("found 3, expected 4")
     assert str(CLASSES[name]("found 3")) == "found 3"
     assert CLASSES[name].__doc__
+
+
+def test_problems_of_a_document_are_few_short_and_on_one_line() -> None:
+    class Document(BaseModel):
+        model_config = ConfigDict(extra="forbid")
+        first: int
+
+    with pytest.raises(ValidationError) as caught:
+        Document.model_validate({"first": "x" * 5000, "a\nb": 1, "c" * 5000: 2, "d": 3, "e": 4})
+    text = errors.brief_problems(caught.value)
+    assert text.startswith("first: Input should be a valid integer")
+    assert text.endswith("and 2 more")
+    assert text.isprintable()
+    assert len(text) < 600
+    assert "pydantic" not in text

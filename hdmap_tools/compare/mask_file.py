@@ -12,14 +12,16 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from hdmap_tools.errors import FormatError
+from hdmap_tools.errors import FormatError, brief_problems
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, MapClass
 from hdmap_tools.types import NDArrayBool
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Size = Annotated[int, Field(gt=0)]
+# Beyond any map, yet small enough that no sum or product of them loses a millimetre.
+_CityMetres = Annotated[float, Field(gt=-1e8, lt=1e8)]
+_Size = Annotated[int, Field(gt=0, lt=2**31)]
 
 
 class MaskSidecar(BaseModel):
@@ -28,8 +30,8 @@ class MaskSidecar(BaseModel):
     Other fields (where it comes from, notes) are allowed and not read.
 
     Attributes:
-        resolution_m: Size of a pixel.
-        origin_xy_m: (x, y) of the picture's south-west corner, city metres.
+        resolution_m: Size of a pixel, 1 mm to 1 km.
+        origin_xy_m: (x, y) of the picture's south-west corner, city metres, each below 1e8.
         size_px: (width, height) of the picture; row 0 is the north edge.
         classes: Map classes whose union the mask marks.
         map_origin_latlon: Latitude and longitude of city (0, 0), where known.
@@ -37,8 +39,8 @@ class MaskSidecar(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    resolution_m: Annotated[float, Field(gt=0, allow_inf_nan=False)]
-    origin_xy_m: tuple[_Finite, _Finite]
+    resolution_m: Annotated[float, Field(ge=0.001, le=1000)]
+    origin_xy_m: tuple[_CityMetres, _CityMetres]
     size_px: tuple[_Size, _Size]
     classes: Annotated[tuple[MapClass, ...], Field(min_length=1)] = DRIVABLE_CLASSES
     map_origin_latlon: tuple[_Finite, _Finite] | None = None
@@ -100,13 +102,12 @@ def _load_sidecar(path: Path, mask_path: Path) -> MaskSidecar:
         raise FormatError(f"{path} is not a readable text file: {error}") from error
     try:
         return MaskSidecar.model_validate(json.loads(text))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise FormatError(f"{path} is not JSON: {error}") from error
     except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(map(str, p['loc'])) or 'document'}: {p['msg']}" for p in error.errors()
-        )
-        raise FormatError(f"{path} does not describe a mask: {problems}.") from error
+        raise FormatError(f"{path} does not describe a mask: {brief_problems(error)}.") from error
+    except RecursionError as error:
+        raise FormatError(f"{path} is not JSON of a mask: it is nested too deeply.") from error
+    except ValueError as error:  # no JSON, or a number of thousands of digits
+        raise FormatError(f"{path} is not JSON: {error}") from error
 
 
 def _read_mask_png(path: Path, sidecar: MaskSidecar) -> NDArrayBool:

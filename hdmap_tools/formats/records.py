@@ -13,7 +13,7 @@ import shapely
 from pydantic import ValidationError
 from shapely.geometry.base import BaseGeometry
 
-from hdmap_tools.errors import FormatError, HDMapError
+from hdmap_tools.errors import FormatError, HDMapError, brief_problems
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import MapElement
 from hdmap_tools.map_model.vector_map import VectorMap
@@ -105,11 +105,8 @@ def element_from_fields(
     try:
         return element_type.model_validate({**known, "geometry": geometry})
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
         raise FormatError(
-            f"{name} is not a valid {element_type.element_type}: {where + ': ' if where else ''}"
-            f"{first['msg']}."
+            f"{name} is not a valid {element_type.element_type}: {brief_problems(error)}."
         ) from error
 
 

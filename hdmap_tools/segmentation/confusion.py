@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from hdmap_tools.errors import ConfigError, LabelError, ShapeError
+from hdmap_tools.errors import ConfigError, LabelError, ShapeError, brief_problems
 from hdmap_tools.labels.label_set import (
     LabelSet,
     MapClass,
@@ -202,7 +202,15 @@ class ConfusionMatrix:
         """
         try:
             document = ConfusionDocument.model_validate(json.loads(text))
-        except (json.JSONDecodeError, ValidationError, RecursionError) as error:
+        except ValidationError as error:
+            raise ConfigError(
+                f"{what} is not a confusion matrix: {brief_problems(error)}."
+            ) from error
+        except RecursionError as error:
+            raise ConfigError(
+                f"{what} is not a confusion matrix: it is nested too deeply."
+            ) from error
+        except ValueError as error:  # no JSON, or a number of thousands of digits
             raise ConfigError(f"{what} is not a confusion matrix: {error}") from error
         sets = []
         for given, names, side in (

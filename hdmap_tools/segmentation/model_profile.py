@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from hdmap_tools.errors import ConfigError
+from hdmap_tools.errors import ConfigError, brief_problems
 from hdmap_tools.labels.label_set import builtin_label_sets
 from hdmap_tools.segmentation.segmenter import ModelProfile
 
@@ -51,7 +51,11 @@ def load_profile(name_or_path: str | Path) -> ModelProfile:
         )
     try:
         profile = ModelProfile.model_validate(json.loads(path.read_text(encoding="utf-8")))
-    except (json.JSONDecodeError, UnicodeDecodeError, OSError, ValidationError) as error:
+    except ValidationError as error:
+        raise ConfigError(f"{path} is not a model profile: {brief_problems(error)}.") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path} is not a model profile: it is nested too deeply.") from error
+    except (ValueError, OSError) as error:  # no JSON, no UTF-8, a number of thousands of digits
         raise ConfigError(f"{path} is not a model profile: {error}") from error
     beside = path.parent / profile.label_set
     if profile.label_set not in builtin_label_sets() and beside.is_file():

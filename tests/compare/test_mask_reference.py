@@ -122,7 +122,12 @@ GRID = BevGrid(0.1, 0, 0, 4, 4)
 def one_line(error: pytest.ExceptionInfo[FormatError]) -> str:
     text = str(error.value)
     assert "\n" not in text
+    assert len(text) < 600
+    assert "0" * 20 not in text
     return text
+
+
+SIDECAR = {"resolution_m": 0.1, "origin_xy_m": [0, 0], "size_px": [4, 4]}
 
 
 def test_no_sidecar(write_mask: WriteMask) -> None:
@@ -138,6 +143,14 @@ def test_no_sidecar(write_mask: WriteMask) -> None:
     [
         ("{", "not JSON"),
         ("[" * 100000, "not JSON"),
+        (json.dumps(SIDECAR)[:-1] + ', "note": ' + "9" * 9000 + "}", "not JSON"),
+        (json.dumps(SIDECAR | {"resolution_m": 1e300}), "resolution_m: .* 1000"),
+        (json.dumps(SIDECAR | {"resolution_m": 1e-9}), "resolution_m"),
+        (json.dumps(SIDECAR | {"resolution_m": 10**300}), "resolution_m"),
+        (json.dumps(SIDECAR | {"origin_xy_m": [0, -1e8]}), "origin_xy_m.1"),
+        (json.dumps(SIDECAR | {"origin_xy_m": [10**300, 0]}), "origin_xy_m.0"),
+        (json.dumps(SIDECAR | {"size_px": [10**300, 4]}), "size_px.0"),
+        (json.dumps(SIDECAR | {"size_px": ["x"] * 3000}), "size_px"),
         ("[]", "does not describe a mask"),
         ("{}", "resolution_m: Field required"),
         ('{"resolution_m": NaN, "origin_xy_m": [0, 0], "size_px": [4, 4]}', "resolution_m"),

@@ -87,12 +87,25 @@ def test_an_unknown_name_lists_the_shipped_ones():
         load_profile("no-such-profile")
 
 
-@pytest.mark.parametrize("content", [b"", b"[]", b"{", b"\xff", b'{"name": "x"}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[]",
+        b"{",
+        b"\xff",
+        b'{"name": "x"}',
+        b"[" * 100_000,
+        b'{"name": ' + b"9" * 9000 + b"}",
+    ],
+)
 def test_a_file_that_is_no_profile(content, tmp_path):
     path = tmp_path / "p.json"
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"p\.json is not a model profile"):
+    with pytest.raises(ConfigError, match=r"p\.json is not a model profile") as caught:
         load_profile(path)
+    assert "\n" not in str(caught.value)
+    assert "pydantic" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
