@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import reprlib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -15,6 +16,17 @@ from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
 
 SCHEMA_VERSION: Final = 1
 """Version of hdmap.yaml; raised when a field changes its meaning."""
+
+_NUMBERS: Final = {
+    "tag:yaml.org,2002:int": re.compile(
+        r"[-+]?(?:0b[01_]+|0[0-7_]+|0|[1-9][0-9_]*|0x[0-9a-fA-F_]+)$"
+    ),
+    "tag:yaml.org,2002:float": re.compile(
+        r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?"
+        r"|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$"
+    ),
+}
+"""How plain numbers look in hdmap.yaml."""
 
 
 class _Step(BaseModel):
@@ -239,7 +251,11 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
             document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
         except FileNotFoundError as error:
             raise ConfigError(f"No configuration file {path}.") from error
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        except RecursionError as error:
+            raise ConfigError(
+                f"{path} is nested too deeply; expected a mapping of steps with their fields."
+            ) from error
+        except (yaml.YAMLError, ValueError, OSError) as error:  # a number of 5000 digits, too
             raise ConfigError(
                 f"{path} is not readable YAML: {' '.join(str(error).split())}"
             ) from error
@@ -275,7 +291,10 @@ def load_config(path: Path | None, overrides: dict[str, Any] | None = None) -> C
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without repeated keys, of which PyYAML would silently keep the last."""
+    """YAML without repeated keys, of which PyYAML would silently keep the last.
+
+    Numbers are those of YAML 1.1 without base 60, in which ``1:30`` would be 90.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -290,7 +309,16 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, _NUMBERS.get(tag, pattern)) for tag, pattern in resolvers]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
 def _short(value: Any) -> str:
     # A few lines of YAML aliases can stand for gigabytes of text.
-    text = reprlib.repr(value)
+    try:
+        text = reprlib.repr(value)
+    except ValueError:  # a hexadecimal number that Python does not write in decimal
+        return "a number of thousands of digits"
     return text if len(text) <= 120 else text[:117] + "..."

@@ -172,10 +172,11 @@ configs = st.builds(
     ),
     fusion=st.builds(
         FusionConfig,
-        resolution_m=st.floats(1e-3, 10.0),
+        resolution_m=st.floats(0.01, 10.0),
         count_mode=st.sampled_from(["majority", "share", "frame", "point"]),
         intensity_threshold=st.integers(1, 255) | st.just("auto"),
-        reference_height_m=st.floats(-1e4, 1e4),
+        # Whole millimetres only.
+        reference_height_m=st.integers(-(10**7), 10**7).map(lambda mm: mm / 1000),
     ),
     observation=st.builds(
         ObservationConfig,
@@ -221,3 +222,30 @@ def test_every_field_of_every_step_is_explained() -> None:
     for step in steps(Config):
         for field in step.model_fields:
             assert f"{field}:" in step.__doc__, f"{step.__name__}.{field} is not in the docstring"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("a: " + "[" * 5000, "nested too deeply"),
+        ("fusion: {reference_height_m: " + "9" * 5000 + "}", "digits"),
+        ("vectorize: {seed: 0x" + "f" * 5000 + ", seat: 0x" + "f" * 5000 + "}", "digits"),
+        ("export: {origin: 2024-99-99}", "month"),
+        ("fusion: {resolution_m: 1:30}", "fusion.resolution_m"),
+        ("fusion: {reference_height_m: 1:30.5}", "fusion.reference_height_m"),
+    ],
+)
+def test_yaml_that_is_hostile_or_means_something_else(
+    tmp_path: Path, content: str, says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says) as error:
+        load_config(written(tmp_path, content))
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 600
+
+
+def test_numbers_are_read_as_ever(tmp_path: Path) -> None:
+    text = "{a: 12, b: -1_000, c: 0x1F, d: 0, e: 1.5e+3, f: .5, g: -.inf, h: 017, i: 0b11, j: 1:30}"
+    options = load_config(written(tmp_path, f"vectorize: {{options: {{p: {text}}}}}"))
+    expected = yaml.safe_load(text) | {"j": "1:30"}
+    assert options.vectorize.options["p"] == expected
