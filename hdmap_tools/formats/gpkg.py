@@ -108,6 +108,11 @@ def read_gpkg(path: str | os.PathLike[str]) -> VectorMap:
                 continue
             meta, fids, wkb, columns = read(path, layer=name, return_fids=True)
             frame = _checked_frame(frame, meta["crs"], f"{source}, layer {name}")
+            if wkb is None and len(fids):
+                raise FormatError(
+                    f"{source}, layer {name} is a table without geometry; expected "
+                    f"{element_type.geometry_type} Z. Rename the table, or add its geometry in QGIS."
+                )
             fields = [str(field) for field in meta["fields"]]
             for row, fid in enumerate(fids):
                 elements.append(
@@ -191,6 +196,12 @@ def _column(
         texts = [json.dumps(v, sort_keys=True, separators=(",", ":")) for v in values]
         return np.array(texts, dtype=object), None
     if kind is str:
+        for text, element in zip(values, elements, strict=True):
+            if text is not None and not _is_unicode(text):
+                raise FormatError(
+                    f"{name} of {element.element_type} {element.id!a} is {ascii(text)[:80]}, which "
+                    "holds half a character (a lone surrogate); a GeoPackage holds Unicode text."
+                )
         return np.array(values, dtype=object), None
     mask = np.array([v is None for v in values], dtype=bool)
     filled = [kind() if v is None else v for v in values]
@@ -204,6 +215,14 @@ def _column(
     return np.array(filled, dtype={int: np.int64, float: np.float64, bool: bool}[kind]), (
         mask if mask.any() else None
     )
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _read_element(

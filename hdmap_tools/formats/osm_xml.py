@@ -27,6 +27,7 @@ from hdmap_tools.formats.osm_document import (
 )
 
 MAX_TAG_BYTES: Final = 10_000_000
+MAX_HEIGHT_M: Final = 1e5
 _BLOCK_BYTES: Final = 1 << 16
 _INTEGER = re.compile(r"[+-]?[0-9]{1,19}")
 
@@ -149,7 +150,7 @@ class _OsmTarget:
         if self._open == "node":
             lat = self._number(self._attributes.get("lat"), "lat", 90.0)
             lon = self._number(self._attributes.get("lon"), "lon", 180.0)
-            ele = self._number(self._tags.pop("ele", "0"), "ele", math.inf)
+            ele = self._number(self._tags.pop("ele", "0"), "ele", MAX_HEIGHT_M)
             layer[identifier] = OsmNode(identifier, lat, lon, ele, self._tags)
         elif self._open == "way":
             layer[identifier] = OsmWay(identifier, tuple(self._refs), self._tags)
@@ -173,8 +174,9 @@ class _OsmTarget:
         if math.isfinite(value) and abs(value) <= limit:
             return value
         found = "missing" if text is None else repr(text[:40])
-        expected = "a finite number" + (f" within ±{limit:g}" if math.isfinite(limit) else "")
-        self._refuse(f"{self._where()}: {what} is {found}, expected {expected}")
+        self._refuse(
+            f"{self._where()}: {what} is {found}, expected a finite number within ±{limit:g}"
+        )
         raise AssertionError
 
     def _where(self) -> str:

@@ -13,6 +13,7 @@ from shapely.geometry import LineString
 from hdmap_tools.errors import CRSMismatchError, FormatError, OutputExistsError
 from hdmap_tools.formats import gpkg
 from hdmap_tools.formats.gpkg import read_gpkg, write_gpkg
+from hdmap_tools.formats.records import element_from_fields
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import ELEMENT_TYPES, LaneMark, MapElement
 from hdmap_tools.map_model.vector_map import VectorMap
@@ -197,3 +198,31 @@ def test_layers_of_others_are_counted_and_another_crs_refused(
     pyogrio.raw.write(tmp_path / "c.gpkg", wkb, [], [], layer="lane_mark", crs="EPSG:4326", **line)
     with pytest.raises(CRSMismatchError, match="projected"):
         read_gpkg(tmp_path / "c.gpkg")
+
+
+def test_a_layer_without_geometry_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.gpkg"
+    ids = np.array(["a"], dtype=object)
+    pyogrio.raw.write(
+        path, None, [ids], ["id"], layer="lane_mark", driver="GPKG", geometry_type=None, crs=None
+    )
+    with pytest.raises(FormatError, match="lane_mark is a table without geometry"):
+        read_gpkg(path)
+
+
+@pytest.mark.parametrize("fields", [{"id": "a\ud800"}, {"id": "a", "plugin": "\udc00"}])
+def test_half_a_character_is_refused_by_name(fields: dict[str, str], tmp_path: Path) -> None:
+    mark = LaneMark(geometry=LineString([(0, 0, 0), (1, 2, 3)]), **fields)
+    with pytest.raises(FormatError, match=r"lane_mark 'a.* half a character") as caught:
+        write_gpkg(VectorMap(MapFrame(), (mark,)), tmp_path / "a.gpkg")
+    assert str(caught.value).isascii()
+    assert not list(tmp_path.iterdir())
+
+
+def test_up_to_three_wrong_fields_are_named_at_once() -> None:
+    fields = {"id": 5, "confidence": 7.0, "style": "wavy", "width_m": "wide"}
+    with pytest.raises(FormatError, match=r"^feature 3 is not a valid lane_mark: id: ") as caught:
+        element_from_fields(LaneMark, fields, LineString([(0, 0, 0), (1, 2, 3)]), "feature 3")
+    text = str(caught.value)
+    assert text.count(";") == 3
+    assert text.endswith("and 1 more.")

@@ -122,6 +122,7 @@ def test_deep_nesting_is_refused(tmp_path: Path) -> None:
         ('<node id="1" lat="" lon="1"/>', "lat is ''"),
         ('<node id="1" lat="1" lon="1"><tag k="ele" v="high"/></node>', "ele is 'high'"),
         ('<node id="1" lat="1" lon="1"><tag k="ele" v="1e999"/></node>', "ele is '1e999'"),
+        ('<node id="1" lat="1" lon="1"><tag k="ele" v="1e300"/></node>', "within ±100000"),
         ('<node lat="1" lon="1"/>', "without an id: the id is no value"),
         ('<node id="9223372036854775808" lat="1" lon="1"/>', "64-bit"),
         (f'<node id="{"9" * 5000}" lat="1" lon="1"/>', "64-bit"),
