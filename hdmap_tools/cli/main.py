@@ -1,15 +1,21 @@
 """The `hdmap` command: finds its commands, and turns errors into one line and an exit code.
 
 Exit codes: 0 done; 1 an error, said in one line; 2 wrong usage; 3 done, but a
-vectorizer failed and its elements are missing.
+vectorizer failed and its elements are missing; 130 interrupted; 143 terminated.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import importlib
 import logging
 import re
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
 from typing import Any, Final
 
 import click
@@ -32,6 +38,24 @@ _COMMANDS: Final = {
 
 EXIT_ERROR: Final = 1
 EXIT_PLUGIN_FAILED: Final = 3
+EXIT_INTERRUPTED: Final = 130
+EXIT_TERMINATED: Final = 143
+
+_ACCESS_ADVICE: Final = "check that it can be read and written"
+_SPACE_ADVICE: Final = "free some space, or write to another disk"
+_OS_ADVICE: Final = {
+    errno.EACCES: _ACCESS_ADVICE,
+    errno.EPERM: _ACCESS_ADVICE,
+    errno.EROFS: "it is read-only; write to another folder",
+    errno.ENOSPC: _SPACE_ADVICE,
+    errno.EDQUOT: _SPACE_ADVICE,
+    errno.ENOENT: "check the path",
+    errno.ENOTDIR: "check the path: a part of it is a file",
+    errno.EISDIR: "it is a folder; give a file",
+    errno.EMFILE: "raise the limit of open files with `ulimit -n`",
+    errno.EIO: "the disk or the network failed; check it and run again",
+}
+"""What to do about errors of the system that no command foresaw."""
 
 
 class _LazyGroup(click.Group):
@@ -119,33 +143,66 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line; the console script's entry."""
     arguments = list(sys.argv[1:] if args is None else args)
     show_traceback = _wants_traceback(arguments)
-    try:
-        code: Any = hdmap.main(args=arguments, prog_name="hdmap", standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("Interrupted.", err=True)
-        sys.exit(130)
-    except Exception as error:
-        from hdmap_tools.errors import HDMapError
-
-        if show_traceback:
-            raise
-        if isinstance(error, HDMapError):
-            message = " ".join(str(error).split())
-        elif isinstance(error, OSError):
-            message = " ".join(str(error).split()) + " (-vv shows where)"
-        elif isinstance(error, MemoryError):
-            message = "Out of memory; take a coarser resolution or a shorter drive."
-        else:
-            message = (
-                f"Unexpected {type(error).__name__}: {' '.join(str(error).split())}. This is a bug in "
-                "hdmap_tools or in a package it uses; run again with -vv for the traceback."
-            )
-        click.echo(f"Error: {message}", err=True)
-        sys.exit(EXIT_ERROR)
+    with _termination_as_interrupt() as terminations:
+        try:
+            code: Any = hdmap.main(args=arguments, prog_name="hdmap", standalone_mode=False)
+        except click.ClickException as error:
+            error.show()
+            sys.exit(error.exit_code)
+        except (click.Abort, KeyboardInterrupt):
+            click.echo("Terminated." if terminations else "Interrupted.", err=True)
+            sys.exit(EXIT_TERMINATED if terminations else EXIT_INTERRUPTED)
+        except Exception as error:
+            if show_traceback:
+                raise
+            click.echo(f"Error: {_described(error)}", err=True)
+            sys.exit(EXIT_ERROR)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+@contextlib.contextmanager
+def _termination_as_interrupt() -> Iterator[list[int]]:
+    """Let SIGTERM unwind the stack like Ctrl-C, so that temporary folders go; gives those that came."""
+    received: list[int] = []
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        if len(received) == 1:  # a second one must not cut the cleaning short
+            raise KeyboardInterrupt
+
+    # Only the main thread may set handlers, and a caller's own way to end is left alone.
+    is_ours = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    )
+    if not is_ours:
+        yield received
+        return
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield received
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _described(error: Exception) -> str:
+    """What went wrong and what to do, on one line."""
+    from hdmap_tools.errors import HDMapError
+
+    text = " ".join(str(error).split())
+    if isinstance(error, HDMapError):
+        return text
+    if isinstance(error, OSError):
+        if error.strerror:
+            text = error.strerror + ("" if error.filename is None else f": {error.filename!r}")
+        advice = _OS_ADVICE.get(error.errno or 0)
+        return f"{text} ({advice + '; ' if advice else ''}-vv shows where)"
+    if isinstance(error, MemoryError):
+        return "Out of memory; take a coarser resolution or a shorter drive."
+    return (
+        f"Unexpected {type(error).__name__}: {text}. This is a bug in hdmap_tools or in a package it "
+        "uses; run again with -vv for the traceback."
+    )
 
 
 def _wants_traceback(arguments: list[str]) -> bool:
