@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
@@ -99,6 +99,17 @@ class AssociationConfig(_Step):
     lookup_range_m: Annotated[float, Field(gt=0)] = 25.0
 
 
+def _is_whole_millimetres(value: float) -> float:
+    # Otherwise changing the reference height of a merged map would not be exact.
+    if abs(value * 1000 - round(value * 1000)) > 1e-6:
+        raise ValueError("must be a whole number of millimetres")
+    return value
+
+
+WholeMillimetres = Annotated[float, AfterValidator(_is_whole_millimetres)]
+"""Metres that are a whole number of millimetres."""
+
+
 class FusionConfig(_Step):
     """How frames become counts.
 
@@ -116,15 +127,7 @@ class FusionConfig(_Step):
     resolution_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     count_mode: Literal["majority", "share", "frame", "point"] = "share"
     intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
-    reference_height_m: float = 0.0
-
-    @field_validator("reference_height_m")
-    @classmethod
-    def _is_whole_millimetres(cls, value: float) -> float:
-        # Otherwise changing the reference of a merged map would not be exact.
-        if abs(value * 1000 - round(value * 1000)) > 1e-6:
-            raise ValueError("must be a whole number of millimetres")
-        return value
+    reference_height_m: WholeMillimetres = 0.0
 
 
 class ObservationConfig(_Step):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _MAX_PROBLEMS: Final = 3
-_MAX_CHARACTERS: Final = 160
+_MAX_SHOWN: Final = 160
 
 
 class HDMapError(Exception):
@@ -120,15 +120,25 @@ class MissingExtraError(HDMapError, ImportError):
     """An optional dependency is needed and not installed."""
 
 
-def brief_problems(error: ValidationError) -> str:
-    """At most three problems of a document as ``field: problem``, on one line, for a message."""
+def brief_problems(error: ValidationError, whole: str = "document") -> str:
+    """At most three problems of a document as ``field: problem``, on one line, for a message.
+
+    A problem of no single field is put down to what `whole` calls the document.
+    """
     details = error.errors(include_url=False, include_context=False, include_input=False)
     lines = []
     for detail in details[:_MAX_PROBLEMS]:
-        where = ".".join(str(part) for part in detail["loc"]) or "document"
+        where = ".".join(str(part) for part in detail["loc"]) or whole
         line = f"{where}: {detail['msg'].removeprefix('Value error, ')}"
-        line = line if line.isprintable() else ascii(line)  # names of fields come from the file
-        lines.append(line if len(line) <= _MAX_CHARACTERS else line[: _MAX_CHARACTERS - 3] + "...")
+        lines.append(line if line.isprintable() and len(line) <= _MAX_SHOWN else shown(line))
     if num_more := len(details) - len(lines):
         lines.append(f"and {num_more} more")
     return "; ".join(lines)
+
+
+def shown(text: str) -> str:
+    """For a message: quoted, on one line, and not long."""
+    quoted = ascii(text)
+    return (
+        quoted if len(quoted) <= _MAX_SHOWN else f"{quoted[:_MAX_SHOWN]}… ({len(text)} characters)"
+    )

@@ -8,7 +8,6 @@ import numpy.typing as npt
 NDArrayFloat: TypeAlias = npt.NDArray[np.float64]
 NDArrayFloat32: TypeAlias = npt.NDArray[np.float32]
 NDArrayInt: TypeAlias = npt.NDArray[np.int64]
-NDArrayInt32: TypeAlias = npt.NDArray[np.int32]
 NDArrayByte: TypeAlias = npt.NDArray[np.uint8]
 NDArrayBool: TypeAlias = npt.NDArray[np.bool_]
 NDArrayAny: TypeAlias = npt.NDArray[Any]

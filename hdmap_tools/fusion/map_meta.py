@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 
+from hdmap_tools.config import WholeMillimetres
 from hdmap_tools.errors import MapMismatchError
 from hdmap_tools.fusion.voting import CountMode, quanta_per_vote
 from hdmap_tools.geometry.map_frame import MapFrame
@@ -34,16 +35,9 @@ class MapMeta(BaseModel):
     label_set: LabelSet
     count_mode: CountMode
     intensity_threshold: Annotated[int, Field(ge=1, le=255)]
-    reference_height_m: float = 0.0
+    reference_height_m: WholeMillimetres = 0.0
     frame_document: dict[str, Any] = Field(default_factory=lambda: MapFrame().to_json())
     model: str = ""
-
-    @model_validator(mode="after")
-    def _reference_is_whole_millimetres(self) -> MapMeta:
-        # Otherwise changing the reference of a merged map would not be exact.
-        if abs(self.reference_height_m * 1000 - round(self.reference_height_m * 1000)) > 1e-6:
-            raise ValueError("reference_height_m must be a whole number of millimetres")
-        return self
 
     @property
     def frame(self) -> MapFrame:

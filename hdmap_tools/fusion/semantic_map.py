@@ -185,11 +185,6 @@ class SemanticMap:
         """The smallest grid that covers all tiles, or None for an empty map."""
         return grid_of_tiles(self.tile_indices(), self.meta)
 
-    def read_tile(self, index: TileIndex) -> Tile:
-        """The layers of one tile; zeros where nothing was observed."""
-        with self._reading():
-            return _read_tile(self._group(), index)
-
     def window(self, grid: BevGrid) -> Tile:
         """The layers over any grid of this map's lattice.
 

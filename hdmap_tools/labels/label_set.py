@@ -12,7 +12,7 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from hdmap_tools.errors import LabelError
+from hdmap_tools.errors import LabelError, brief_problems, shown
 from hdmap_tools.types import NDArrayByte
 
 IGNORE_ID: Final = 255
@@ -33,10 +33,6 @@ MAP_CLASSES: Final[tuple[MapClass, ...]] = tuple(MapClass)
 
 DRIVABLE_CLASSES: Final = (MapClass.ROAD, MapClass.CROSSWALK, MapClass.LANE_MARK)
 """Where a vehicle may be: the ground between the road's boundaries."""
-
-
-_MAX_PROBLEMS: Final = 3
-_MAX_SHOWN: Final = 160
 
 
 def _printable(name: str) -> str:
@@ -181,13 +177,13 @@ def load_label_set(name_or_path: str | Path) -> LabelSet:
         is_file = False
     if not is_file:
         raise LabelError(
-            f"{_shown(str(name_or_path))} is neither a label set ({', '.join(sorted(shipped))}) nor "
+            f"{shown(str(name_or_path))} is neither a label set ({', '.join(sorted(shipped))}) nor "
             "a JSON file."
         )
     try:
         return LabelSet.model_validate(json.loads(path.read_text(encoding="utf-8")))
     except ValidationError as error:
-        reason = _problems(error)
+        reason = brief_problems(error, "the file")
     except RecursionError:
         reason = "it is nested too deeply"
     except OSError as error:
@@ -195,24 +191,3 @@ def load_label_set(name_or_path: str | Path) -> LabelSet:
     except ValueError as error:  # no JSON, no UTF-8, or a number of thousands of digits
         reason = f"it is not valid JSON ({error})"
     raise LabelError(f"{path} is not a label set: {reason}.")
-
-
-def _problems(error: ValidationError) -> str:
-    """At most three problems on one line, each with its field."""
-    details = error.errors(include_url=False, include_context=False, include_input=False)
-    lines = []
-    for detail in details[:_MAX_PROBLEMS]:
-        field_name = ".".join(str(part) for part in detail["loc"])
-        text = f"{field_name or 'the file'}: {detail['msg'].removeprefix('Value error, ')}"
-        lines.append(text if text.isprintable() and len(text) <= _MAX_SHOWN else _shown(text))
-    if num_more := len(details) - len(lines):
-        lines.append(f"and {num_more} more")
-    return "; ".join(lines)
-
-
-def _shown(text: str) -> str:
-    """For a message: quoted, on one line, and not long."""
-    quoted = ascii(text)
-    return (
-        quoted if len(quoted) <= _MAX_SHOWN else f"{quoted[:_MAX_SHOWN]}… ({len(text)} characters)"
-    )
