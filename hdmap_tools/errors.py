@@ -19,6 +19,8 @@
     │   ├── PluginLoadError                   importing it failed
     │   └── PluginFailedError                 it raised, or returned what it must not
     ├── FormatError (ValueError)              a map file cannot be read or written
+    ├── WorldError (ValueError)               a map that no vehicle can be simulated on
+    ├── PointMapError (ValueError)            a point map cannot be made or used
     ├── OutputExistsError (FileExistsError)   would overwrite
     └── MissingExtraError (ImportError)       an optional dependency is not installed
 
@@ -110,6 +112,14 @@ class PluginFailedError(PluginError):
 
 class FormatError(HDMapError, ValueError):
     """A map file cannot be read, or a map cannot be written in that format."""
+
+
+class WorldError(HDMapError, ValueError):
+    """A map gives no world to drive through: no usable lanes, no route, not readable."""
+
+
+class PointMapError(HDMapError, ValueError):
+    """A point map cannot be made, read, or does not fit the drive."""
 
 
 class OutputExistsError(HDMapError, FileExistsError):
