@@ -297,10 +297,17 @@ def _by_tile(
     cells: NDArrayInt,
 ) -> Iterator[tuple[TileIndex, NDArrayInt, NDArrayInt, NDArrayInt]]:
     """Group cells (N, 2) by tile: (tile, rows of the input, y in the tile, x in the tile)."""
-    tiles, which = np.unique(cells // TILE_CELLS, axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    for number, (tx, ty) in enumerate(tiles.tolist()):
-        rows = np.flatnonzero(which == number)
+    if len(cells) == 0:
+        return
+    tiles = cells // TILE_CELLS
+    low = tiles.min(axis=0)
+    # Tiles as single numbers: sorting rows is many times slower.
+    height = int(tiles[:, 1].max() - low[1]) + 1
+    number = (tiles[:, 0] - low[0]) * height + tiles[:, 1] - low[1]
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+    for rows in np.split(order, starts[1:]):
+        tx, ty = tiles[rows[0]].tolist()
         within = cells[rows] - (tx * TILE_CELLS, ty * TILE_CELLS)
         yield (tx, ty), rows, within[:, 1], within[:, 0]
 

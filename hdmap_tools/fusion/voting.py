@@ -69,18 +69,10 @@ def cast_votes(
     if len(cells) == 0:
         empty = np.zeros(0, dtype=np.int64)
         return Votes(np.zeros((0, 2), dtype=np.int64), empty, empty)
-    # Cells as single numbers: sorting rows is many times slower.
-    packed, cell_index = np.unique(
-        (cells[:, 0] + _OFFSET) * (2 * _OFFSET) + cells[:, 1] + _OFFSET, return_inverse=True
-    )
-    unique_cells = np.column_stack([packed // (2 * _OFFSET), packed % (2 * _OFFSET)]) - _OFFSET
     channels = labels.astype(np.int64) * num_bins + bins.astype(np.int64)
-    # One row for each (cell, channel) with the number of points in it.
-    span = int(channels.max()) + 1
-    key, points = np.unique(cell_index * span + channels, return_counts=True)
-    cell, channel = key // span, key % span
+    unique_cells, cell, channel, points = _tally(np.asarray(cells, dtype=np.int64), channels)
     if mode == "point":
-        return Votes(unique_cells[cell], channel, points.astype(np.int64))
+        return Votes(unique_cells[cell], channel, points)
     chance = _hash(unique_cells[cell], channel, frame_key)
     if mode == "share":
         quanta = _apportion(cell, points, chance)
@@ -98,6 +90,30 @@ def cast_votes(
     label_chance = _hash(unique_cells[cell[best_bin]], label[best_bin], frame_key)
     winner = best_bin[_first_of_each(cell[best_bin], label_points, label_chance)]
     return Votes(unique_cells[cell[winner]], channel[winner], np.ones(len(winner), np.int64))
+
+
+def _tally(
+    cells: NDArrayInt, channels: NDArrayInt
+) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt, NDArrayInt]:
+    """Cells (C, 2) in order; and a row for each cell and channel: cell, channel, number of points."""
+    from hdmap_tools.fusion.vote_kernels import tally
+
+    return tally(cells, channels) or tally_by_sorting(cells, channels)
+
+
+def tally_by_sorting(
+    cells: NDArrayInt, channels: NDArrayInt
+) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt, NDArrayInt]:
+    """The same as `vote_kernels.tally`, for points however far apart."""
+    # Cells as single numbers: sorting rows is many times slower.
+    packed, cell_index = np.unique(
+        (cells[:, 0] + _OFFSET) * (2 * _OFFSET) + cells[:, 1] + _OFFSET, return_inverse=True
+    )
+    unique_cells = np.column_stack([packed // (2 * _OFFSET), packed % (2 * _OFFSET)]) - _OFFSET
+    # One row for each (cell, channel) with the number of points in it.
+    span = int(channels.max()) + 1
+    key, points = np.unique(cell_index * span + channels, return_counts=True)
+    return unique_cells, key // span, key % span, points.astype(np.int64)
 
 
 def _first_of_each(group: NDArrayInt, points: NDArrayAny, chance: NDArrayAny) -> NDArrayInt:

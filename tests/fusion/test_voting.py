@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdmap_tools.fusion.voting import SHARE_QUANTA, Votes, cast_votes
+from hdmap_tools.fusion.vote_kernels import tally
+from hdmap_tools.fusion.voting import SHARE_QUANTA, Votes, cast_votes, tally_by_sorting
 
 
 def votes_of(labels, mode, *, cells=None, bins=None, frame_key=0, num_bins=2):
@@ -96,3 +97,28 @@ def test_no_points_no_votes(mode):
     )
     assert isinstance(votes, Votes)
     assert len(votes.cells) == len(votes.channels) == len(votes.quanta) == 0
+
+
+@given(points, st.integers(-(10**6), 10**6))
+@settings(max_examples=150, deadline=None)
+def test_counting_in_a_box_equals_sorting(rows, shift):
+    array = np.array(rows, dtype=np.int64).reshape(-1, 4)
+    if len(array) == 0:
+        return
+    cells, channels = array[:, :2] + shift, array[:, 2] * 2 + array[:, 3]
+    compiled = tally(cells, channels)
+    assert compiled is not None
+    for mine, plain in zip(compiled, tally_by_sorting(cells, channels), strict=True):
+        assert mine.dtype == plain.dtype
+        assert np.array_equal(mine, plain)
+
+
+def test_points_far_apart_are_sorted():
+    cells = np.array([[0, 0], [10**5, 10**5], [0, 0]], dtype=np.int64)
+    channels = np.array([1, 0, 1], dtype=np.int64)
+    assert tally(cells, channels) is None
+    votes = cast_votes(
+        cells, np.array([1, 0, 1]), np.zeros(3, int), num_bins=1, mode="point", frame_key=0
+    )
+    assert votes.cells.tolist() == [[0, 0], [10**5, 10**5]]
+    assert votes.quanta.tolist() == [2, 1]
