@@ -2,9 +2,29 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
+import numpy as np
+import shapely
+
+from hdmap_tools.errors import WorldError
+from hdmap_tools.geometry.polyline import arc_lengths
+from hdmap_tools.simulate.route_search import RoadGraph, find_lanes
+from hdmap_tools.simulate.smooth_line import between, curvature, smoothed
+from hdmap_tools.simulate.world_map import WorldMap
 from hdmap_tools.types import NDArrayFloat
+
+logger = logging.getLogger(__name__)
+
+STEP_M: Final = 0.25
+MIN_LENGTH_M: Final = 10.0
+MAX_LATERAL_MPS2: Final = 2.0
+MAX_ALONG_MPS2: Final = 1.5
+_MAX_START_DISTANCE_M: Final = 10.0
+_MAX_CHANGE_M: Final = 45.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,3 +40,216 @@ class Route:
     xy: NDArrayFloat
     step_m: float
     lane_ids: tuple[str, ...]
+
+    @property
+    def length_m(self) -> float:
+        """Along the line."""
+        return (len(self.xy) - 1) * self.step_m
+
+
+def plan_route(world: WorldMap, length_m: float, start: str | None, seed: int) -> Route:
+    """Plan a drive along connected road lanes; it ends early, with a warning, where they do.
+
+    At forks it takes lanes not driven yet from which it can go on; where a lane ends it
+    changes to a neighbour across a dashed line. Loops are driven again where nothing else
+    is left.
+
+    Args:
+        world: Where to drive.
+        length_m: Of the drive.
+        start: A lane's id (from its begin), or ``X,Y`` in metres of the city frame (from
+            the nearest lane's nearest point); None chooses, by the seed, among the starts
+            of the longest drives.
+        seed: Of the choices.
+
+    Returns:
+        The route; along it the middle of the lanes, smoothed.
+
+    Raises:
+        WorldError: If the world has no road lanes, the start is none of them or more than
+            10 m from all, or the drive would be shorter than 10 m.
+    """
+    graph = RoadGraph.of_world(world)
+    if not graph.length_m:
+        raise WorldError(
+            f"The map {world.name} has no lanes for vehicles; expected at least one to drive on."
+        )
+    rng = np.random.default_rng(seed)
+    skipped_m = 0.0
+    if start is None:
+        starts = sorted(graph.length_m)
+    else:
+        lane_id, skipped_m = _start_lane(world, graph, start)
+        starts = [lane_id]
+    lane_ids = find_lanes(graph, length_m + skipped_m + 1.0, starts, rng)
+    line, half_width_m = _joined(world, graph, lane_ids)
+    along = arc_lengths(line)
+    kept = (along >= skipped_m) & (along <= skipped_m + length_m + 5.0)
+    found_m = float(along[-1] - skipped_m)
+    if found_m < MIN_LENGTH_M or kept.sum() < 2:
+        raise WorldError(
+            f"The longest drive found in {world.name}"
+            + (f" from {start}" if start is not None else "")
+            + f" is {max(found_m, 0.0):.1f} m; expected at least {MIN_LENGTH_M:g} m of connected "
+            "lanes. Choose another start, or check that the lanes of the map share end points."
+        )
+    xy = smoothed(line[kept], half_width_m[kept], STEP_M)
+    # Evenly spaced to a hair: smoothing shortens bends, and the wanted length ends between points.
+    along = arc_lengths(xy)
+    count = int(min(length_m, float(along[-1])) / STEP_M + 1e-9) + 1
+    at = np.arange(count) * STEP_M
+    xy = np.column_stack([np.interp(at, along, xy[:, k]) for k in range(2)])
+    route = Route(xy, STEP_M, _driven_lanes(world, lane_ids, xy))
+    if route.length_m < length_m - STEP_M:
+        logger.warning(
+            "The drive through %s is %.0f m long instead of %.0f m: its lanes end there.",
+            world.name,
+            route.length_m,
+            length_m,
+        )
+    return route
+
+
+def _start_lane(world: WorldMap, graph: RoadGraph, start: str) -> tuple[str, float]:
+    """The lane to start on, and how far along it."""
+    if start in graph.length_m:
+        return start, 0.0
+    if start in world.lanes:
+        raise WorldError(
+            f"The start {start} is a lane for {world.lanes[start].kind}s in {world.name}; "
+            "expected one for vehicles."
+        )
+    try:
+        x, y = (float(text) for text in start.split(","))
+    except ValueError:
+        x = y = float("nan")
+    if not np.isfinite([x, y]).all():
+        few = ", ".join(sorted(graph.length_m)[:3])
+        raise WorldError(
+            f"The start {start[:60]!r} is no lane of {world.name}; expected one of its "
+            f"{len(graph.length_m)} road lanes (such as {few}), or X,Y in metres."
+        )
+    point = shapely.Point(x, y)
+    middles = {
+        k: shapely.LineString(between(world.lanes[k].left, world.lanes[k].right)[0])
+        for k in graph.length_m
+    }
+    nearest = min(middles, key=lambda k: (middles[k].distance(point), k))
+    distance_m = middles[nearest].distance(point)
+    if distance_m > _MAX_START_DISTANCE_M:
+        raise WorldError(
+            f"The start {x:g},{y:g} is {distance_m:.1f} m from the nearest road lane of "
+            f"{world.name} ({nearest}); expected at most {_MAX_START_DISTANCE_M:g} m."
+        )
+    return nearest, float(middles[nearest].project(point))
+
+
+def _joined(
+    world: WorldMap, graph: RoadGraph, lane_ids: Sequence[str]
+) -> tuple[NDArrayFloat, NDArrayFloat]:
+    """Middle of the lanes (N, 2) in driving order, and half their width (N,)."""
+    lines, widths = [], []
+    k = 0
+    while k < len(lane_ids):
+        here = world.lanes[lane_ids[k]]
+        middle, half_width = between(here.left, here.right)
+        following = lane_ids[k + 1] if k + 1 < len(lane_ids) else None
+        is_change = following in graph.changes[here.id] and following not in here.successors
+        if following is not None and is_change:
+            other = world.lanes[following]
+            middle, half_width = _changing(middle, half_width, *between(other.left, other.right))
+            k += 1
+        lines.append(middle)
+        widths.append(half_width)
+        k += 1
+    return np.concatenate(lines), np.concatenate(widths)
+
+
+def _changing(
+    middle: NDArrayFloat,
+    half_width: NDArrayFloat,
+    other: NDArrayFloat,
+    other_half_width: NDArrayFloat,
+) -> tuple[NDArrayFloat, NDArrayFloat]:
+    """From one lane's middle to its neighbour's, at most 45 m long, in the middle of both."""
+    count = max(len(middle), len(other))
+    share = np.linspace(0.0, 1.0, count)
+
+    def at_shares(values: NDArrayFloat) -> NDArrayFloat:
+        given = np.linspace(0.0, 1.0, len(values))
+        return np.column_stack([np.interp(share, given, column) for column in values.T])
+
+    a = at_shares(np.column_stack([middle, half_width]))
+    b = at_shares(np.column_stack([other, other_half_width]))
+    span = min(_MAX_CHANGE_M / max(float(arc_lengths(middle)[-1]), 1e-9), 0.9)
+    t = np.clip((share - (1.0 - span) / 2.0) / span, 0.0, 1.0)
+    blend = (t**3 * (10.0 - 15.0 * t + 6.0 * t**2))[:, None]
+    mixed = (1.0 - blend) * a + blend * b
+    return mixed[:, :2], mixed[:, 2]
+
+
+def _driven_lanes(world: WorldMap, lane_ids: Sequence[str], xy: NDArrayFloat) -> tuple[str, ...]:
+    """The lanes as far as the line goes."""
+    return tuple(lane_ids)
+
+
+def motion_along(
+    route: Route, speed_mps: float, rate_hz: float
+) -> tuple[NDArrayFloat, NDArrayFloat]:
+    """When the vehicle is where: at most `speed_mps`, slower in bends, smoothly.
+
+    Lateral acceleration stays below 2 m/s², that along the route below 1.5 m/s² and
+    continuous. The drive begins and ends at the speed the road there allows.
+
+    Args:
+        route: What it follows.
+        speed_mps: On straight roads.
+        rate_hz: Of the result.
+
+    Returns:
+        times_s (K,) from 0 in steps of 1 / rate_hz, and arc_m (K,) metres along the route,
+        rising, the last within one step of its end.
+    """
+    if not (np.isfinite([speed_mps, rate_hz]).all() and speed_mps > 0 and rate_hz > 0):
+        raise WorldError(
+            f"Speed and rate must be positive, found {speed_mps:g} m/s and {rate_hz:g} Hz."
+        )
+    step = route.step_m
+    bend = np.abs(curvature(route.xy))
+    squared = np.minimum(speed_mps**2, MAX_LATERAL_MPS2 / np.maximum(bend, 1e-9))
+    # v² changes by at most 2·a·ds; lower envelope of cones of that slope, forward then back.
+    ramp = 2.0 * MAX_ALONG_MPS2 * step * np.arange(len(squared))
+    squared = np.minimum.accumulate(squared - ramp) + ramp
+    squared = (np.minimum.accumulate((squared - ramp[::-1])[::-1]) + ramp)[::-1]
+    # Lowest within a reach, then the mean over it: neither steeper nor above what it was.
+    squared = _mean_of_lowest(squared, reach=max(round(2.0 / step), 1))
+    speed = np.sqrt(squared)
+    taken_s = 2.0 * step / (speed[:-1] + speed[1:])
+    at_s = np.concatenate([[0.0], np.cumsum(taken_s)])
+    times_s = np.arange(int(at_s[-1] * rate_hz + 1e-9) + 1) / rate_hz
+    k = np.clip(np.searchsorted(at_s, times_s, side="right") - 1, 0, len(taken_s) - 1)
+    late_s = times_s - at_s[k]
+    gain = (speed[k + 1] - speed[k]) / taken_s[k]
+    arc_m = k * step + speed[k] * late_s + 0.5 * gain * late_s**2
+    return times_s, np.minimum(arc_m, route.length_m)
+
+
+def _mean_of_lowest(values: NDArrayFloat, reach: int) -> NDArrayFloat:
+    window = 2 * reach + 1
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, reach, mode="edge"), window)
+    lowest = around.min(axis=1)
+    hann = np.hanning(window + 2)[1:-1]
+    padded = np.pad(lowest, reach, mode="edge")
+    return np.asarray(np.convolve(padded, hann / hann.sum(), mode="valid"))
+
+
+def places_along(route: Route, arc_m: NDArrayFloat) -> tuple[NDArrayFloat, NDArrayFloat]:
+    """Position (K, 2), city frame, and yaw (K,), radians, unwrapped, at arc lengths (K,).
+
+    The rear axle follows the line, so the yaw is the direction of its tangent.
+    """
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(np.arange(len(route.xy)) * route.step_m, route.xy)
+    tangent = spline(arc_m, 1)
+    return spline(arc_m), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))

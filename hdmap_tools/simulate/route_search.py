@@ -1,0 +1,206 @@
+"""Which lanes to drive: long, with as few lanes twice as the map allows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hdmap_tools.simulate.smooth_line import between
+from hdmap_tools.simulate.world_map import LineKind, WorldLane, WorldMap
+
+MIN_CHANGE_M: Final = 25.0
+"""Lanes shorter than this are not changed on."""
+_LOOK_AHEAD_M: Final = 400.0
+_MAX_STARTS: Final = 48
+_NEARLY_BEST: Final = 0.97
+
+
+@dataclass(frozen=True)
+class RoadGraph:
+    """Road lanes that can be driven, and where one can go from each.
+
+    Attributes:
+        length_m: Of each lane's middle.
+        successors: Lanes ahead.
+        changes: Lanes beside, in the same direction, behind a dashed line.
+    """
+
+    length_m: Mapping[str, float]
+    successors: Mapping[str, tuple[str, ...]]
+    changes: Mapping[str, tuple[str, ...]]
+
+    @classmethod
+    def of_world(cls, world: WorldMap) -> RoadGraph:
+        """Of a world's road lanes."""
+        roads = {k: lane for k, lane in world.lanes.items() if lane.kind == "road"}
+        length_m = {}
+        for k, lane in roads.items():
+            middle, _ = between(lane.left, lane.right)
+            length_m[k] = float(np.hypot(*np.diff(middle, axis=0).T).sum())
+        length_m = {k: length for k, length in length_m.items() if length > 0.1}
+        successors = {k: tuple(s for s in roads[k].successors if s in length_m) for k in length_m}
+        return cls(length_m, successors, _lane_changes(world, roads, length_m))
+
+
+def _lane_changes(
+    world: WorldMap, roads: Mapping[str, WorldLane], length_m: Mapping[str, float]
+) -> dict[str, tuple[str, ...]]:
+    paints = {
+        line.id: line.paint
+        for line in world.lines
+        if line.kind is LineKind.PAINT and line.paint is not None
+    }
+    by_left: dict[str, list[str]] = {}
+    for k in length_m:
+        if (left_line := roads[k].left_line) is not None:
+            by_left.setdefault(left_line, []).append(k)
+    changes: dict[str, set[str]] = {k: set() for k in length_m}
+    for k in length_m:
+        shared = roads[k].right_line
+        paint = paints.get(shared) if shared is not None else None
+        if paint is None or "dashed" not in paint.style.value or length_m[k] < MIN_CHANGE_M:
+            continue
+        for other in by_left.get(str(shared), ()):
+            # The neighbour on the right runs the same way if the shared line does in both.
+            same = np.allclose(roads[k].right[0], roads[other].left[0], atol=0.1)
+            if same and length_m[other] >= MIN_CHANGE_M and other != k:
+                changes[k].add(other)
+                changes[other].add(k)
+    return {k: tuple(sorted(found)) for k, found in changes.items()}
+
+
+def find_lanes(
+    graph: RoadGraph, length_m: float, starts: Sequence[str], rng: np.random.Generator
+) -> list[str]:
+    """The lanes of one of the best drives from any of the starts.
+
+    Drives are compared by how long they become (up to `length_m`), then by how much of them
+    is new road. From each start some are tried: at every fork the lane driven least, from
+    which the drive can go on long enough, with the most new road ahead.
+
+    Args:
+        graph: Lanes that can be driven.
+        length_m: Wanted.
+        starts: Lanes to start on.
+        rng: Chooses among the starts whose drives are about as good as the best.
+
+    Returns:
+        Ids in driving order. Where two that follow each other are neighbours and no
+        successors, the vehicle changes lane.
+    """
+    reach_m = _reach(graph, length_m)
+    order = [starts[k] for k in rng.permutation(len(starts))]
+    order.sort(key=lambda k: -round(reach_m[k]))
+    found = []
+    for start in order[:_MAX_STARTS]:
+        lanes = _drive(graph, length_m, start, reach_m, rng)
+        driven, new = _measure(graph, lanes, length_m)
+        found.append((driven + 0.5 * new, lanes))
+    best = max(score for score, _ in found)
+    return next(lanes for score, lanes in found if score >= _NEARLY_BEST * best)
+
+
+def _reach(graph: RoadGraph, length_m: float) -> dict[str, float]:
+    """The longest drive from the begin of each lane, lanes driven again allowed, up to a limit.
+
+    The limit is somewhat above `length_m`, so that a drive that goes on beats one that ends.
+    """
+    limit = length_m + 50.0
+    reach = dict(graph.length_m)
+    waiting = set(reach)
+    before: dict[str, list[str]] = {}
+    for k, ways in graph.successors.items():
+        for other in ways:
+            before.setdefault(other, []).append(k)
+    while waiting:
+        k = waiting.pop()
+        for earlier in before.get(k, ()):
+            longer = min(graph.length_m[earlier] + reach[k], limit)
+            if longer > reach[earlier] + 1e-6:
+                reach[earlier] = longer
+                waiting.add(earlier)
+        for beside in graph.changes[k]:
+            if reach[k] > reach[beside] + 1e-6:
+                reach[beside] = reach[k]
+                waiting.add(beside)
+    return reach
+
+
+def _drive(
+    graph: RoadGraph,
+    length_m: float,
+    start: str,
+    reach_m: Mapping[str, float],
+    rng: np.random.Generator,
+) -> list[str]:
+    visits: Counter[str] = Counter([start])
+    lanes = [start]
+    driven = graph.length_m[start]
+    has_changed = False
+    while driven < length_m:
+        here = lanes[-1]
+        needed = length_m - driven
+        options = graph.successors[here]
+        can_go_on = max((reach_m[k] for k in options), default=0.0)
+        if can_go_on < needed and not has_changed:
+            better = [
+                k for k in graph.changes[here] if reach_m[k] - graph.length_m[k] > can_go_on + 1.0
+            ]
+            if better:
+                lanes.append(max(better, key=lambda k: (reach_m[k], k)))
+                visits[lanes[-1]] += 1
+                has_changed = True
+                continue
+        if not options:
+            break
+        enough = [k for k in options if reach_m[k] >= min(needed, can_go_on) - 1e-6]
+        tie = rng.random(len(enough))
+        chosen = max(
+            range(len(enough)),
+            key=lambda i: (
+                -visits[enough[i]],
+                round(_new_ahead(graph, enough[i], visits), -1),
+                tie[i],
+            ),
+        )
+        lanes.append(enough[chosen])
+        visits[enough[chosen]] += 1
+        driven += graph.length_m[enough[chosen]]
+        has_changed = False
+    return lanes
+
+
+def _new_ahead(graph: RoadGraph, start: str, visits: Mapping[str, int]) -> float:
+    """Length of the longest way ahead along lanes not driven yet, about, up to a limit."""
+    best = 0.0
+    stack = [(start, 0.0, frozenset[str]())]
+    looks = 0
+    while stack and looks < 200:
+        here, length, on_way = stack.pop()
+        looks += 1
+        if visits.get(here, 0) or here in on_way:
+            continue
+        length += graph.length_m[here]
+        best = max(best, length)
+        if length < _LOOK_AHEAD_M:
+            on_way = on_way | {here}
+            stack.extend((k, length, on_way) for k in graph.successors[here])
+    return min(best, _LOOK_AHEAD_M)
+
+
+def _measure(graph: RoadGraph, lanes: Sequence[str], length_m: float) -> tuple[float, float]:
+    """Length driven, up to what is wanted, and how much of it for the first time."""
+    driven = new = 0.0
+    seen: set[str] = set()
+    for k, lane in enumerate(lanes):
+        is_change = k + 1 < len(lanes) and lanes[k + 1] in graph.changes[lane]
+        is_change = is_change and lanes[k + 1] not in graph.successors[lane]
+        part = 0.0 if is_change else min(graph.length_m[lane], length_m - driven)
+        driven += part
+        new += part if lane not in seen else 0.0
+        seen.add(lane)
+    return driven, new
