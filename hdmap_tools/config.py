@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+)
 
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
@@ -130,6 +138,22 @@ class FusionConfig(_Step):
     reference_height_m: WholeMillimetres = 0.0
 
 
+def _intensity_term(value: Any) -> Any:
+    # Earlier files say true or false; and YAML 1.1 reads a bare `off` as false.
+    if isinstance(value, bool):
+        return "gamma" if value else "off"
+    return value
+
+
+IntensityTerm = Annotated[
+    Literal["off", "gamma", "learned"],
+    BeforeValidator(
+        _intensity_term, json_schema_input_type=bool | Literal["off", "gamma", "learned"]
+    ),
+]
+"""How lidar intensity weighs in; true and false are read as ``gamma`` and ``off``."""
+
+
 class ObservationConfig(_Step):
     """How counts are read as probabilities.
 
@@ -142,12 +166,18 @@ class ObservationConfig(_Step):
         other_prior: Prior probability of that. A network that has one label for all
             that is not road cannot tell a lawn from a building; without evidence
             between them, "none of these" is what is claimed.
-        intensity: Add the intensity term for lane marks.
+        intensity: ``off``; ``gamma`` is the paper's: votes with an intensity at or above
+            k speak for lane mark; ``learned`` holds the mean intensity of each cell
+            against what each class looks like.
         gamma: Weight of an intensity at or above k, as evidence for lane mark (log-likelihood).
+        intensity_likelihood: ``learned``: file with what each class looks like; None
+            learns it from the map itself.
+        intensity_weight: ``learned``: weight of that one observation a cell.
         vanilla_lambda: λ in M = μ(I + λ1).
         smoothing: Laplace smoothing: added to each entry of the confusion matrix, as a
             share of its row.
-        temperature: Divides the evidence; above 1 is more careful.
+        temperature: Divides the evidence of the votes; above 1 is more careful. Frames
+            that see one place err alike, which counting them hides.
         priors: Prior probability by class; missing ones share what is left.
         fill_radius_cells: Radius of hole filling; 0 turns it off.
     """
@@ -156,8 +186,10 @@ class ObservationConfig(_Step):
     confusion: Path | None = None
     other: bool = True
     other_prior: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    intensity: bool = False
+    intensity: IntensityTerm = "off"
     gamma: Annotated[float, Field(ge=0)] = 2.0
+    intensity_likelihood: Path | None = None
+    intensity_weight: Annotated[float, Field(ge=0)] = 1.0
     vanilla_lambda: Annotated[float, Field(gt=0)] = 0.1
     smoothing: Annotated[float, Field(gt=0, lt=1)] = 0.01
     temperature: Annotated[float, Field(gt=0)] = 1.0

@@ -102,7 +102,7 @@ def run(
         )
         with steps.timed("read"):
             made = maps[config.association.method]
-            model = model_for(made.meta, config)
+            model = model_for(made.meta, config, made)
             windows = {method: whole_window(one, model, config) for method, one in maps.items()}
             window = windows[config.association.method]
         with steps.timed("vectorize"):

@@ -21,6 +21,7 @@ from hdmap_tools.compare.raster import RasterComparison
 from hdmap_tools.config import SCHEMA_VERSION, Config
 from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.formats.records import METADATA_VERSION
+from hdmap_tools.fusion.intensity_likelihood import IntensityDocument
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.map_model.elements import ELEMENT_TYPES, MapElement
 from hdmap_tools.run_metrics import RunMetrics
@@ -39,6 +40,7 @@ _MODELS: Final[tuple[tuple[str, type[BaseModel], int, _Mode], ...]] = (
     ("label_set", LabelSet, 1, "validation"),
     ("model_profile", ModelProfile, 1, "validation"),
     ("confusion_matrix", ConfusionDocument, 1, "validation"),
+    ("intensity_likelihood", IntensityDocument, 1, "validation"),
     ("mask", MaskSidecar, 1, "validation"),
     ("raster_comparison", RasterComparison, 1, "serialization"),
     ("run_metrics", RunMetrics, 1, "serialization"),

@@ -98,7 +98,7 @@ def vectorize_alone(
         raise OutputExistsError(f"{out} exists; use --overwrite to replace it.")
     choose(config.vectorize)  # what is wrong with the plugins asked for is said before any work
     semantic_map = SemanticMap.open(map_path)
-    window = whole_window(semantic_map, model_for(semantic_map.meta, config), config)
+    window = whole_window(semantic_map, model_for(semantic_map.meta, config, semantic_map), config)
     result = vectorize(window, config.vectorize)
     write_gpkg(result.vector_map, out, overwrite=overwrite)
     return result
@@ -115,7 +115,7 @@ def compare_alone(
 ) -> RasterComparison:
     """Hold a semantic map against a reference; near the driven path if the drive is given."""
     semantic_map = SemanticMap.open(map_path)
-    window = whole_window(semantic_map, model_for(semantic_map.meta, config), config)
+    window = whole_window(semantic_map, model_for(semantic_map.meta, config, semantic_map), config)
     reference = load_reference(reference_path, window.grid)
     path_xy = None
     if drive_path is not None:

@@ -1,21 +1,26 @@
 """How counts become probabilities; applied on reading, so a new model needs no rebuild.
 
-    log P(S=c | z, I) = log prior(c) + (sum_l N[l] log M[c, l] + gamma N_high [c = lane mark]) / (w T) - log Z
+    log P(S=c | z, I) = log prior(c) + (sum_l N[l] log M[c, l] + gamma N_high [c = lane mark]) / (w T)
+                        + v log P(i | c) - log Z
 
 with N the counts, w the counts that one frame's vote is worth and T the
-temperature. Source: Paz et al. 2020, equations 3 to 8, written over counts.
+temperature. Source: Paz et al. 2020, equations 3 to 8, written over counts. The
+last term, v log P(i | c), goes beyond the paper and takes the place of gamma: i is
+the cell's mean intensity, one observation a cell. T does not divide it: it tempers
+what many frames repeat, and the mean is taken once.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from hdmap_tools.config import ObservationConfig
 from hdmap_tools.errors import ConfigError, LabelError
+from hdmap_tools.fusion.intensity_likelihood import IntensityLikelihood
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.labels.label_set import Label, LabelSet, MapClass
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
@@ -38,32 +43,74 @@ class ObservationModel:
         log_prior: (class,) natural logarithm of the prior; minus infinity for a
             class that the labels cannot tell (no label, no measured row).
         votes_per_count: 1 / (w T).
+        intensity: What the mean intensity of a cell says, or None; its classes are
+            this model's.
+        intensity_weight: v, the weight of that.
     """
 
     classes: tuple[str, ...]
     log_likelihood: NDArrayFloat
     log_prior: NDArrayFloat
     votes_per_count: float
+    intensity: IntensityLikelihood | None = None
+    intensity_weight: float = 1.0
 
-    def posterior(self, counts: NDArrayAny) -> NDArrayFloat:
+    def posterior(
+        self, counts: NDArrayAny, mean_intensity: NDArrayFloat | None = None
+    ) -> NDArrayFloat:
         """Class probabilities from counts.
 
         Args:
             counts: (label, bin, y, x) of any real dtype.
+            mean_intensity: (y, x) mean intensity 0..255 of each cell, NaN where none;
+                only a model with an intensity likelihood looks at it.
 
         Returns:
             (class, y, x) float64; sums to 1 over class, NaN where all counts are 0.
         """
-        labels, bins, rows, cols = counts.shape
-        evidence = self.log_likelihood.reshape(len(self.classes), -1) @ counts.reshape(
-            labels * bins, rows * cols
-        ).astype(np.float64)
-        log_posterior = self.log_prior[:, None] + evidence * self.votes_per_count
+        log_posterior = self.offset(mean_intensity) + self.evidence(counts)
         log_posterior -= log_posterior.max(axis=0)
         posterior = np.exp(log_posterior)
         posterior /= posterior.sum(axis=0)
-        posterior[:, ~(counts.reshape(labels * bins, -1) > 0).any(axis=0)] = np.nan
-        return posterior.reshape(len(self.classes), rows, cols)
+        posterior[:, ~(counts > 0).any(axis=(0, 1))] = np.nan
+        return np.asarray(posterior)
+
+    def evidence(self, counts: NDArrayAny) -> NDArrayFloat:
+        """(class, y, x) what the votes say: log-likelihood up to a constant, divided by T.
+
+        Args:
+            counts: (label, bin, y, x) of any real dtype.
+        """
+        labels, bins, rows, cols = counts.shape
+        summed = self.log_likelihood.reshape(len(self.classes), -1) @ counts.reshape(
+            labels * bins, rows * cols
+        ).astype(np.float64)
+        return np.asarray(
+            (summed * self.votes_per_count).reshape(len(self.classes), rows, cols),
+            dtype=np.float64,
+        )
+
+    def offset(self, mean_intensity: NDArrayFloat | None) -> NDArrayFloat:
+        """(class, y, x) or (class, 1, 1) what is known beside the votes: prior and intensity.
+
+        Args:
+            mean_intensity: As for `posterior`.
+        """
+        log_prior = self.log_prior[:, None, None]
+        if self.intensity is None or mean_intensity is None:
+            return log_prior
+        seen = self.intensity.log_likelihood(mean_intensity)
+        return np.asarray(log_prior + self.intensity_weight * seen)
+
+    def with_intensity(self, likelihood: IntensityLikelihood, weight: float) -> ObservationModel:
+        """The same model with a learned intensity term.
+
+        Raises:
+            LabelError: If the likelihood knows none of the model's classes.
+        """
+        return replace(
+            self, intensity=likelihood.for_classes(self.classes), intensity_weight=weight
+        )
 
 
 def observation_model(
@@ -73,6 +120,9 @@ def observation_model(
     confusion: ConfusionMatrix | None,
 ) -> ObservationModel:
     """Make the model that a configuration asks for, for a map's label set.
+
+    A learned intensity term is in it only where its file is given; what is learned
+    from a map itself needs that map (`hdmap_tools.fusion.learn_intensity`).
 
     Raises:
         ConfigError: If a confusion matrix is asked for and there is none, or the
@@ -116,14 +166,18 @@ def observation_model(
             " or ".join(untold),
         )
     log_likelihood = np.repeat(np.log(likelihood)[:, :, None], meta.num_bins, axis=2)
-    if config.intensity and MapClass.LANE_MARK in names:
+    if config.intensity == "gamma" and MapClass.LANE_MARK in names:
         log_likelihood[names.index(MapClass.LANE_MARK), :, 1] += config.gamma
-    return ObservationModel(
+    model = ObservationModel(
         names,
         log_likelihood,
         _log_prior(config, names, can_tell),
         1.0 / (meta.quanta_per_vote * config.temperature),
     )
+    if config.intensity == "learned" and config.intensity_likelihood is not None:
+        likelihood_of_intensity = IntensityLikelihood.load(config.intensity_likelihood)
+        model = model.with_intensity(likelihood_of_intensity, config.intensity_weight)
+    return model
 
 
 def vanilla_likelihood(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -54,7 +55,7 @@ def read_window(
         "intensity": np.full(grid.shape, np.nan, dtype=np.float32),
         "height": np.full(grid.shape, np.nan, dtype=np.float32),
     }
-    for block in _blocks_with_evidence(source.tile_indices(), grid, fill_radius_cells):
+    for block in blocks_with_evidence(source.tile_indices(), grid, fill_radius_cells):
         rows = slice(block.y_min - grid.y_min, block.y_max - grid.y_min)
         cols = slice(block.x_min - grid.x_min, block.x_max - grid.x_min)
         posterior[:, rows, cols], read = _read_block(source, block, model, fill_radius_cells)
@@ -70,7 +71,7 @@ def read_window(
     return MapWindow(dataset, grid)
 
 
-def _blocks_with_evidence(
+def blocks_with_evidence(
     tiles: tuple[TileIndex, ...], grid: BevGrid, reach_cells: int
 ) -> Iterator[BevGrid]:
     """The grid cut along tiles; only pieces with a tile in them or within reach."""
@@ -89,24 +90,65 @@ def _read_block(
     source: HasCounts, block: BevGrid, model: ObservationModel, radius: int
 ) -> tuple[NDArrayFloat, dict[str, NDArrayAny]]:
     """Posterior (class, y, x) and the other layers (y, x) of one block."""
-    # A margin, so that filling does not see the block's edge.
-    layers = source.window(block.expand(radius)).layers
-    counts = layers["counts"]
-    posterior = model.posterior(counts)
-    if radius > 0:
-        unknown = np.isnan(posterior[0])
-        if not unknown.all():
-            filled = model.posterior(box_mean(counts, radius))
-            posterior = np.where(unknown, filled, posterior)
+    read = read_counts(source, block, radius)
+    posterior = model.posterior(read.counts, read.mean_intensity)
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = -np.where(posterior > 0, posterior * np.log(posterior), 0.0).sum(axis=0)
         entropy[np.isnan(posterior[0])] = np.nan
-        height = layers["height_sum"] / layers["height_n"] / 1000.0 + source.meta.reference_height_m
-        intensity = layers["intensity_sum"] / layers["intensity_n"]
-    votes = counts.sum(axis=(0, 1), dtype=np.float64) / source.meta.quanta_per_vote
-    inner = slice(radius, posterior.shape[1] - radius), slice(radius, posterior.shape[2] - radius)
-    read = {"entropy": entropy, "observations": votes, "intensity": intensity, "height": height}
-    return posterior[:, *inner], {name: values[inner] for name, values in read.items()}
+        height = read.layers["height_sum"] / read.layers["height_n"] / 1000.0
+    votes = read.layers["counts"].sum(axis=(0, 1), dtype=np.float64) / source.meta.quanta_per_vote
+    return posterior, {
+        "entropy": entropy,
+        "observations": votes,
+        "intensity": mean_intensity_of(read.layers),
+        "height": height + source.meta.reference_height_m,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class ReadCounts:
+    """What the observation model is given over a block.
+
+    Attributes:
+        counts: (label, bin, y, x); where nothing was seen, the mean of the neighbours.
+        mean_intensity: (y, x) mean intensity 0..255, filled likewise; NaN where none.
+        layers: What was seen in the cells themselves, by layer of `cell_counts.LAYERS`.
+    """
+
+    counts: NDArrayAny
+    mean_intensity: NDArrayFloat
+    layers: dict[str, NDArrayAny]
+
+
+def read_counts(source: HasCounts, block: BevGrid, radius: int = 0) -> ReadCounts:
+    """Counts and mean intensity over a block, unknown cells filled from a box of this radius."""
+    # A margin, so that filling does not see the block's edge.
+    layers = source.window(block.expand(radius)).layers
+    counts, intensity = layers["counts"], mean_intensity_of(layers)
+    if radius > 0:
+        unknown = ~counts.any(axis=(0, 1))
+        if not unknown.all() and unknown.any():
+            counts = np.where(unknown, box_mean(counts, radius), counts)
+            intensity = np.where(unknown, _box_mean_of_known(intensity, radius), intensity)
+        inner = (..., slice(radius, -radius), slice(radius, -radius))
+        counts, intensity = counts[inner], intensity[inner]
+        layers = {name: layer[inner] for name, layer in layers.items()}
+    return ReadCounts(counts, intensity, layers)
+
+
+def mean_intensity_of(layers: dict[str, NDArrayAny]) -> NDArrayFloat:
+    """(y, x) mean intensity 0..255 of each cell; NaN where no return measured it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(layers["intensity_sum"] / layers["intensity_n"])
+
+
+def _box_mean_of_known(values: NDArrayFloat, radius: int) -> NDArrayFloat:
+    """Mean of the numbers in a box around each cell (y, x); NaN where there are none."""
+    known = np.isfinite(values)
+    as_counts = np.stack([known, np.where(known, values, 0.0)])
+    number, total = box_mean(as_counts[:, None].astype(np.float64), radius)[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(number > 0.0, total / number, np.nan))
 
 
 def box_mean(counts: NDArrayAny, radius: int) -> NDArrayFloat:
