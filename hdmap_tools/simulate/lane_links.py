@@ -23,7 +23,8 @@ def successors_by_gate(
 
     Args:
         lanes: By id; those driven the other way are called ``<id>~``.
-        entries, exits: Left and right point of each lane's begin and end.
+        entries: Left and right point of each lane's begin.
+        exits: Left and right point of each lane's end.
 
     Returns:
         Sorted ids by lane. A lane does not lead into its own reverse.
