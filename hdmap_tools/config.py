@@ -17,6 +17,7 @@ from pydantic import (
     Field,
     ValidationError,
     field_validator,
+    model_validator,
 )
 
 from hdmap_tools.errors import ConfigError
@@ -64,10 +65,13 @@ class SegmentationConfig(_Step):
 
     Attributes:
         model: Path of an ONNX or OpenVINO model; None looks in `models/` in and beside the drive.
+            ``simulated`` puts errors on the true labels of a drive made by `hdmap simulate`.
         profile: Name or path of a model profile; None finds it by the model's hash.
         labels: Folder of label PNGs ``<camera>/<timestamp_ns>.png``, instead of a model.
         label_set: Label set of those PNGs.
         threads: CPU threads of the network; 0 is its own choice.
+        confusion: Confusion matrix that ``simulated`` errs by; None is one assumed.
+        seed: Of the errors of ``simulated``.
     """
 
     model: Path | None = None
@@ -75,15 +79,60 @@ class SegmentationConfig(_Step):
     labels: Path | None = None
     label_set: str | None = None
     threads: Annotated[int, Field(ge=0)] = 0
+    confusion: Path | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+
+class PointsConfig(_Step):
+    """How the dense point map is made.
+
+    Attributes:
+        voxel_mm: Returns are thinned to one point a voxel of this edge.
+        cell_mm: Cells that have a ground height; a whole number of voxels, and 25.6 m
+            are a whole number of cells.
+        min_range_m, max_range_m: Returns nearer to or further from the ego origin (in
+            x-y) are not used: the vehicle itself; what a small error of the pose moves.
+        ground_tolerance_m: How far above or below the estimated ground a return still
+            is ground.
+        remove_moving: Leave out what later or earlier sweeps saw through.
+        normalize_intensity: Undo how intensity depends on ring and range.
+        refine_poses: Register the sweeps to the map first, and put them at those poses.
+    """
+
+    voxel_mm: Annotated[int, Field(ge=20, le=1000)] = 50
+    cell_mm: Annotated[int, Field(ge=100, le=1000)] = 200
+    min_range_m: Annotated[float, Field(ge=0)] = 2.5
+    max_range_m: Annotated[float, Field(gt=0, le=200)] = 40.0
+    ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.1
+    remove_moving: bool = True
+    normalize_intensity: bool = True
+    refine_poses: bool = True
+
+    @model_validator(mode="after")
+    def _cells_fit(self) -> PointsConfig:
+        if 25_600 % self.cell_mm or self.cell_mm % self.voxel_mm:
+            raise ValueError(
+                f"cell_mm {self.cell_mm} must divide 25600, and voxel_mm {self.voxel_mm} must divide it"
+            )
+        return self
+
+
+AssociationMethod = Literal["dense", "surface", "sparse", "planar"]
 
 
 class AssociationConfig(_Step):
     """How labels reach the ground.
 
     Attributes:
-        method: ``surface`` looks each cell up at the height of the ground that the
+        method: ``dense`` labels the points of a point map around the vehicle (the
+            paper's), ``surface`` looks each cell up at the height of the ground that the
             sweep found (dense from one frame), ``sparse`` labels the sweep's own
-            points, ``planar`` looks each cell up on a plane (no lidar needed).
+            points, ``planar`` looks each cell up on a plane (no lidar needed). Where
+            it is not said: ``dense`` with `points`, ``surface`` without.
+        points: The point map (`hdmap points`), or a point cloud, for ``dense``; its
+            poses of the drive are then used by every method. None: ``dense`` makes one first.
+        clip_ahead_m, clip_across_m: ``dense``: points up to so far ahead of the ego
+            origin, and to either side, are labelled.
         also: Methods that `hdmap run` builds in memory beside it, to compare with;
             those that need lidar are left out where there is none.
         min_range_m: Ground nearer to the camera (in x-y) is not used: there the image
@@ -98,13 +147,28 @@ class AssociationConfig(_Step):
             covers more and more ground beyond it.
     """
 
-    method: Literal["surface", "sparse", "planar"] = "surface"
-    also: tuple[Literal["surface", "sparse", "planar"], ...] = ("sparse", "planar")
+    method: AssociationMethod = "surface"
+    points: Path | None = None
+    clip_ahead_m: Annotated[float, Field(gt=0, le=200)] = 15.0
+    clip_across_m: Annotated[float, Field(gt=0, le=200)] = 10.0
+    also: tuple[AssociationMethod, ...] = ("sparse", "planar")
     min_range_m: Annotated[float, Field(ge=0)] = 4.0
     max_range_m: Annotated[float, Field(gt=0)] = 40.0
     ground_tolerance_m: Annotated[float, Field(gt=0)] = 0.1
     occlusion_test: bool = True
     lookup_range_m: Annotated[float, Field(gt=0)] = 25.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _dense_with_points(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("points") is not None:
+            return {"method": "dense", **values}
+        return values
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether a method asked for needs a point map."""
+        return "dense" in (self.method, *self.also)
 
 
 def _is_whole_millimetres(value: float) -> float:
@@ -246,6 +310,7 @@ class Config(_Step):
     classes: Annotated[tuple[MapClass, ...], Field(min_length=1)] = MAP_CLASSES
     drive: DriveConfig = DriveConfig()
     segmentation: SegmentationConfig = SegmentationConfig()
+    points: PointsConfig = PointsConfig()
     association: AssociationConfig = AssociationConfig()
     fusion: FusionConfig = FusionConfig()
     observation: ObservationConfig = ObservationConfig()

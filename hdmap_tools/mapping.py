@@ -13,13 +13,14 @@ from typing import Final
 
 import numpy as np
 
+from hdmap_tools.association.dense import associate_dense, clip_bounds_m
 from hdmap_tools.association.ground import GroundedSweep
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.planar import associate_planar, ground_plane
 from hdmap_tools.association.sparse import associate_sparse
 from hdmap_tools.association.surface import associate_surface
 from hdmap_tools.config import AssociationConfig, Config
-from hdmap_tools.errors import ConfigError, DriveError, PoseError
+from hdmap_tools.errors import ConfigError, DriveError, PointMapError, PoseError
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.intensity import otsu_threshold
 from hdmap_tools.fusion.map_meta import MapMeta
@@ -27,6 +28,7 @@ from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
 from hdmap_tools.opening import require_images
+from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.segmenter import Segmenter
@@ -60,12 +62,25 @@ class FrameCounts:
 
 
 class FrameSource:
-    """Poses and sweeps of a drive's images; keeps the last sweep, which several cameras share."""
+    """Poses and sweeps of a drive's images, and the point map around them.
+
+    Keeps the last sweep, which several cameras share.
+
+    Raises:
+        PointMapError: If a method needs a point map and there is none to open.
+    """
 
     def __init__(self, drive: Drive, config: Config) -> None:
         self._drive = drive
         self._config = config
         self._grounded: tuple[int, GroundedSweep] | None = None
+        self._points: PointMap | None = None
+        if config.association.needs_points:
+            if config.association.points is None:
+                raise PointMapError(
+                    "Method 'dense' needs a point map: make one with `hdmap points` and give it with --points."
+                )
+            self._points = PointMap.open(config.association.points)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -75,8 +90,8 @@ class FrameSource:
         return (association.method, *dict.fromkeys(also))
 
     def allows(self, method: str, image: ImageRef) -> bool:
-        """Whether a method has what it needs at an image: all but ``planar`` need a sweep."""
-        return method == "planar" or self.sweep_ref(image) is not None
+        """Whether a method has what it needs at an image: ``surface`` and ``sparse`` need a sweep."""
+        return method in ("planar", "dense") or self.sweep_ref(image) is not None
 
     def usable_images(self, counts: FrameCounts) -> tuple[ImageRef, ...]:
         """Images with a pose (and a sweep, where the method needs one); the rest is counted.
@@ -164,6 +179,18 @@ class FrameSource:
                 resolution_m,
                 config,
             )
+        if method == "dense":
+            assert self._points is not None
+            return associate_dense(
+                labels,
+                label_set,
+                camera,
+                pose,
+                self._points.points_in(clip_bounds_m(pose, config)),
+                config,
+                None if grounded is None else grounded.points_city[~grounded.is_ground],
+                2.1 if grounded is None else grounded.ring_gap_deg,
+            )
         if grounded is None:
             raise DriveError(f"No lidar sweep near image {image.key}; method {method!r} needs one.")
         if method == "sparse":
@@ -244,10 +271,12 @@ def intensity_threshold(
     given = config.fusion.intensity_threshold
     if given != "auto":
         return given
-    with_sweep = tuple(image for image in images if source.sweep_ref(image) is not None)
-    if not with_sweep:
+    # A point map's intensity is normalized, that of sweeps is not.
+    method = "dense" if source.methods[0] == "dense" else "sparse"
+    with_intensity = tuple(image for image in images if source.allows(method, image))
+    if not with_intensity:
         return _THRESHOLD_WITHOUT_LIDAR
-    step = -(-len(with_sweep) // _IMAGES_FOR_THRESHOLD)
+    step = -(-len(with_intensity) // _IMAGES_FOR_THRESHOLD)
     drivable = [label.id for label in label_set.labels if label.map_class in DRIVABLE_CLASSES]
     if not drivable:
         raise ConfigError(
@@ -256,8 +285,8 @@ def intensity_threshold(
         )
     seen = [
         observations.intensity[np.isin(observations.labels, drivable)]
-        for image, labels in labels_of(with_sweep[::step])
-        if (observations := source.observe("sparse", image, labels, label_set, 1.0)).intensity
+        for image, labels in labels_of(with_intensity[::step])
+        if (observations := source.observe(method, image, labels, label_set, 1.0)).intensity
         is not None
     ]
     threshold = otsu_threshold(np.concatenate(seen)) if seen else None

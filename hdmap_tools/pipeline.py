@@ -20,6 +20,7 @@ from hdmap_tools.mapping import build_map, map_meta
 from hdmap_tools.opening import open_for
 from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.plugin_api import MapWindow
+from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.readers.image import read_image
 from hdmap_tools.run_metrics import RunMetrics, versions
@@ -91,11 +92,13 @@ def run(
             config = settled(config, drive)
             segmenter = open_segmenter(config.segmentation, drive)
             check_settings(config, drive, segmenter)
+        with steps.timed("points"):
+            with_map, drive = with_points(config, drive, folder.parent / "scratch")
         maps, counts = build_map(
             drive,
             segmenter,
             folder / MAP_NAME,
-            config,
+            with_map,
             cache,
             steps,
             also_in=folder.parent / "also",
@@ -150,6 +153,7 @@ def settled(config: Config, drive: Drive) -> Config:
     So that the one written beside the result makes the same map again.
     """
     segmentation, observation, compare = config.segmentation, config.observation, config.compare
+    association = config.association
     model = segmentation.model
     if model is None and segmentation.labels is None:
         model = find_model(drive.root)
@@ -165,6 +169,7 @@ def settled(config: Config, drive: Drive) -> Config:
             "segmentation": segmentation.model_copy(
                 update={"model": _absolute(model), "labels": _absolute(segmentation.labels)}
             ),
+            "association": association.model_copy(update={"points": _absolute(association.points)}),
             "observation": observation.model_copy(
                 update={"confusion": _absolute(observation.confusion)}
             ),

@@ -18,6 +18,7 @@ from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import build_map, map_meta
 from hdmap_tools.opening import open_configured, open_for
 from hdmap_tools.output_folder import map_folder
+from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.segmentation.cache import LabelCache
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.steps import Steps
@@ -64,6 +65,8 @@ def build_alone(
                 map_meta(
                     config, drive, segmenter.label_set, segmenter.name, threshold
                 ).require_compatible(model)
+        with steps.timed("points"):
+            config, drive = with_points(config, drive, folder.parent / "scratch")
         maps, counts = build_map(drive, segmenter, folder, config, cache, steps)
         made = maps[config.association.method]
         return {

@@ -25,12 +25,14 @@ from hdmap_tools import __version__
 _COMMANDS: Final = {
     "run": "Turn a drive into a map.",
     "segment": "Write label images of a drive's images.",
+    "points": "Turn drives into a dense point map.",
     "build": "Fuse a drive into a semantic map.",
     "vectorize": "Run vectorizer plugins over a semantic map.",
     "export": "Write a vector map in another format.",
     "compare": "Hold a semantic map against a reference, where the map has evidence.",
     "confusion": "Measure a network's confusion matrix on annotated images.",
     "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
+    "simulate": "Drive through a map: images, lidar sweeps, poses, and their exact truth.",
     "info": "Say what a drive, a semantic map or a vector file holds.",
     "plugins": "List, describe and check vectorizer plugins.",
 }

@@ -74,12 +74,21 @@ def segmentation_options(function: F) -> F:
     return function
 
 
+METHODS: Final = ("dense", "surface", "sparse", "planar")
+"""Methods of association."""
+
+
 def association_option(function: F) -> F:
-    """--association."""
+    """--association and --points."""
+    function = click.option(
+        "--points",
+        type=PATH,
+        help="Point map (`hdmap points`) or point cloud of the place; its poses are used.",
+    )(function)
     return click.option(
         "--association",
-        type=click.Choice(["surface", "sparse", "planar"]),
-        help="How labels reach the ground [default: surface].",
+        type=click.Choice(METHODS),
+        help="How labels reach the ground [default: dense with --points, else surface].",
     )(function)
 
 
@@ -140,6 +149,8 @@ _FIELD_OF_OPTION: Final = {
     "labels": "segmentation.labels",
     "label_set": "segmentation.label_set",
     "association": "association.method",
+    "points": "association.points",
+    "refine_poses": "points.refine_poses",
     "also": "association.also",
     "resolution": "fusion.resolution_m",
     "confusion": "observation.confusion",
@@ -177,6 +188,9 @@ def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
         value = given.get(option)
         if value is not None and value != ():
             dotted[field] = _plain(value)
+    if given.get("points") is not None:
+        # Above the file, which says `surface` wherever it was made from the defaults.
+        dotted.setdefault("association.method", "dense")
     if given.get("origin") is not None:
         dotted["export.origin"] = parse_origin(given["origin"])
     dotted |= {name.replace("__", "."): value for name, value in fixed.items()}
@@ -217,9 +231,9 @@ def label_cache(cache_folder: Path | None, no_cache: bool) -> LabelCache | None:
 
 
 class ImageProgress:
-    """A progress bar over images on stderr, only where a person is watching."""
+    """A progress bar over images (or sweeps) on stderr, only where a person is watching."""
 
-    def __init__(self, enabled: bool) -> None:
+    def __init__(self, enabled: bool, what: str = "images") -> None:
         from rich.console import Console
         from rich.progress import (
             BarColumn,
@@ -239,7 +253,7 @@ class ImageProgress:
             transient=True,
             disable=not (enabled and console.is_terminal),
         )
-        self._task = self._progress.add_task("images", total=None)
+        self._task = self._progress.add_task(what, total=None)
 
     def __enter__(self) -> SegmentProgress:
         self._progress.start()

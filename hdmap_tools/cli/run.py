@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.option(
     "--also",
     multiple=True,
-    type=click.Choice(["surface", "sparse", "planar"]),
+    type=click.Choice(options.METHODS),
     help="Build this method's map too, to compare with; repeatable [default: sparse and planar].",
 )
 @options.resolution_option

@@ -1,0 +1,68 @@
+"""`hdmap points`: drives into a dense point map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from hdmap_tools.cli import options
+
+
+@click.command()
+@click.argument("sources", metavar="DRIVE...", type=options.PATH, nargs=-1, required=True)
+@click.option("-o", "--out", type=options.PATH, required=True, help="Point map to make.")
+@options.drive_options
+@click.option(
+    "--refine-poses/--no-refine-poses",
+    default=None,
+    help="Register the sweeps to the map, and several drives to one another [default: do].",
+)
+@click.option(
+    "--export",
+    "exports",
+    type=options.PATH,
+    multiple=True,
+    help="Also write all points to this .pcd, .ply, .las or .laz file; repeatable.",
+)
+@options.origin_option
+@options.overwrite_option
+@options.json_option
+@options.config_options
+@click.pass_context
+def command(ctx: click.Context, /, **given: Any) -> None:
+    """Turn drives into a dense point map.
+
+    \b
+    Examples:
+      hdmap points path/to/drive -o points --export points.laz
+      hdmap points monday/drive friday/drive -o points
+
+    DRIVE may also be a point cloud of the place (.pcd, .ply, .las, .laz). The folder OUT
+    holds thinned points without what moved, the ground, and the poses; `hdmap run DRIVE
+    --points OUT` maps with it.
+    """
+    from hdmap_tools.point_map.make import make_points
+
+    config = options.resolve_config(given)
+    with options.ImageProgress(ctx.obj["progress"], "sweeps") as told:
+        report = make_points(
+            given["sources"],
+            given["out"],
+            config,
+            exports=given["exports"],
+            overwrite=given["overwrite"],
+            progress=told,
+        )
+    options.write_json(given["json_path"], report, overwrite=given["overwrite"])
+    click.echo(summary(report, given["out"]))
+
+
+def summary(report: dict[str, Any], out: Path) -> str:
+    """A few lines for people."""
+    sizes = f"{report['num_points']} points in {report['num_tiles']} tiles"
+    lines = [f"{', '.join(report['sources'])}: {sizes} at {out} in {report['seconds']:.1f} s"]
+    for drive, moved in report["refined_poses"].items():
+        lines.append(f"{drive}: poses {'refined' if moved else 'as given'}")
+    return "\n".join(lines)

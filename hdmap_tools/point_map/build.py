@@ -1,0 +1,280 @@
+"""Build a point map from drives: sweeps at their poses, thinned, with the ground found.
+
+Two passes over the sweeps, tile by tile, so that memory does not grow with the drive:
+the first sums returns by voxel, the second looks for voxels that later or earlier
+sweeps saw through.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hdmap_tools.association.ground import estimate_ground, near_ground
+from hdmap_tools.config import PointsConfig
+from hdmap_tools.errors import PointMapError
+from hdmap_tools.geometry.se3 import SE3, Trajectory
+from hdmap_tools.point_map.ground_cells import smooth_ground
+from hdmap_tools.point_map.normalize import IntensityResponse, IntensityStatistics
+from hdmap_tools.point_map.point_map import (
+    DriveOfPoints,
+    PointMap,
+    PointMapMeta,
+    PointTile,
+    TileIndex,
+)
+from hdmap_tools.readers.drive import Drive, Sweep, SweepRef
+from hdmap_tools.types import NDArrayBool, NDArrayFloat
+
+if TYPE_CHECKING:
+    from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, VoxelTiles
+
+_LOG = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
+"""Told how many sweeps of how many are done."""
+
+_SWEEPS_FOR_INTENSITY: Final = 60
+_ASPHALT_FROM_PATH_M: Final = 2.5
+"""Ground this near to the driven path is taken for road."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedDrive:
+    """A drive with the poses that its sweeps are put at.
+
+    Attributes:
+        drive: Where the sweeps come from.
+        trajectory: ``city_SE3_ego``: the drive's own, or refined.
+        is_refined: Which of the two.
+    """
+
+    drive: Drive
+    trajectory: Trajectory
+    is_refined: bool = False
+
+    @classmethod
+    def as_given(cls, drive: Drive) -> PosedDrive:
+        """With the drive's own poses."""
+        return cls(drive, drive.trajectory)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepInCity:
+    """One sweep at its pose: returns within range, and which are ground.
+
+    Attributes:
+        sweep: As read, only returns within range.
+        city_SE3_ego: Pose.
+        points_city: (N, 3) metres.
+        range_m: (N,) from the ego origin in x-y.
+        is_ground: (N,).
+    """
+
+    sweep: Sweep
+    city_SE3_ego: SE3
+    points_city: NDArrayFloat
+    range_m: NDArrayFloat
+    is_ground: NDArrayBool
+
+
+def build_point_map(
+    drives: Sequence[PosedDrive],
+    folder: Path,
+    config: PointsConfig,
+    *,
+    max_pose_gap_s: float = 0.5,
+    progress: Progress | None = None,
+) -> PointMap:
+    """Build a point map into an empty folder.
+
+    Args:
+        drives: Drives of one city frame.
+        folder: Where the map shall be.
+        config: Voxels, range, what is removed and normalized.
+        max_pose_gap_s: Sweeps in a longer gap between poses are left out.
+        progress: Told of sweeps done.
+
+    Raises:
+        PointMapError: If no drive has a sweep with a pose, or no ground is found.
+        CRSMismatchError: If the drives have different frames.
+    """
+    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles
+
+    if not drives:
+        raise PointMapError("A point map needs at least one drive, found none.")
+    for posed in drives[1:]:
+        drives[0].drive.frame.require_same(posed.drive.frame)
+    usable = {posed.drive.id: _usable_sweeps(posed, max_pose_gap_s) for posed in drives}
+    if len(usable) < len(drives):
+        raise PointMapError("Two of the drives have the same id; give each drive once.")
+    passes = 2 if config.remove_moving else 1
+    told = _Counter(progress, passes * sum(map(len, usable.values())))
+    responses = {
+        posed.drive.id: _intensity_response(posed, usable[posed.drive.id], config)
+        for posed in drives
+    }
+    levels = [r.asphalt for r in responses.values() if r is not None]
+    asphalt = float(np.mean(levels)) if levels else None
+    with tempfile.TemporaryDirectory(prefix=".aside.", dir=folder.parent) as aside:
+        grid = VoxelGrid(config.voxel_mm, config.cell_mm)
+        tiles = VoxelTiles(grid, Path(aside))
+        num_ground = 0
+        for posed in drives:
+            response = responses[posed.drive.id]
+            for ref in usable[posed.drive.id]:
+                seen = sweep_in_city(posed, ref, config)
+                intensity = seen.sweep.intensity
+                if response is not None and asphalt is not None:
+                    at_common_level = IntensityResponse(
+                        response.log_ring, response.log_range, asphalt
+                    )
+                    distance = np.linalg.norm(seen.sweep.points_ego, axis=1)
+                    intensity = at_common_level.normalized(intensity, seen.sweep.ring, distance)
+                tiles.add(seen.points_city, intensity, seen.is_ground, seen.range_m)
+                tiles.put_aside(seen.city_SE3_ego.translation, config.max_range_m)
+                num_ground += int(seen.is_ground.sum())
+                told.one_more()
+        tiles.finish()
+        if num_ground == 0:
+            raise PointMapError(
+                f"No ground in any sweep of {', '.join(usable)}: expected returns from the road around the "
+                "vehicle, within 1 m of the height of the ego origin. Check the mount of the lidar."
+            )
+        meta = PointMapMeta(
+            cell_mm=config.cell_mm,
+            voxel_mm=config.voxel_mm,
+            frame_document=drives[0].drive.frame.to_json(),
+            asphalt_intensity=None if asphalt is None else round(asphalt, 3),
+            drives=tuple(
+                DriveOfPoints(
+                    id=posed.drive.id,
+                    poses=f"{number}_{re.sub('[^A-Za-z0-9.-]+', '_', posed.drive.id)[:80]}.feather",
+                    is_refined=posed.is_refined,
+                    num_sweeps=len(usable[posed.drive.id]),
+                )
+                for number, posed in enumerate(drives)
+            ),
+        )
+        trajectories = {posed.drive.id: posed.trajectory for posed in drives}
+        return PointMap.create(folder, meta, _made_tiles(tiles), trajectories)
+
+
+def sweep_in_city(posed: PosedDrive, ref: SweepRef, config: PointsConfig) -> SweepInCity:
+    """Read one sweep and put it where it was seen."""
+    sweep = posed.drive.read_sweep(ref)
+    city_SE3_ego = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
+    distance = np.linalg.norm(sweep.points_ego[:, :2], axis=1)
+    near = (distance <= config.max_range_m) & (distance >= config.min_range_m)
+    sweep = Sweep(
+        sweep.timestamp_ns, sweep.points_ego[near], sweep.intensity[near], sweep.ring[near]
+    )
+    surface = estimate_ground(sweep.points_ego, config.max_range_m)
+    return SweepInCity(
+        sweep,
+        city_SE3_ego,
+        city_SE3_ego.transform_from(sweep.points_ego),
+        distance[near],
+        near_ground(sweep.points_ego, surface, config.ground_tolerance_m),
+    )
+
+
+def _usable_sweeps(posed: PosedDrive, max_pose_gap_s: float) -> tuple[SweepRef, ...]:
+    """Sweeps with a pose; how many have none is said.
+
+    Raises:
+        PointMapError: If there is none.
+    """
+    drive = posed.drive
+    times = np.array([ref.timestamp_ns for ref in drive.sweeps], dtype=np.int64)
+    covered = posed.trajectory.covers(times, max_pose_gap_s)
+    usable = tuple(ref for ref, ok in zip(drive.sweeps, covered, strict=True) if ok)
+    if not usable:
+        first, last = posed.trajectory.timestamps_ns[[0, -1]]
+        raise PointMapError(
+            f"Drive {drive.name} has no lidar sweep with a pose: {len(drive.sweeps)} sweeps, poses from "
+            f"{first} to {last} ns with gaps of at most {max_pose_gap_s} s allowed. A point map needs lidar."
+        )
+    if len(usable) < len(drive.sweeps):
+        _LOG.warning(
+            "%s: %d of %d sweeps left out: no ego pose.",
+            drive.name,
+            len(drive.sweeps) - len(usable),
+            len(drive.sweeps),
+        )
+    return usable
+
+
+def _intensity_response(
+    posed: PosedDrive, refs: Sequence[SweepRef], config: PointsConfig
+) -> IntensityResponse | None:
+    if not config.normalize_intensity:
+        return None
+    path = cKDTree(posed.trajectory.translations[:, :2])
+    statistics = IntensityStatistics()
+    for ref in refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]:
+        seen = sweep_in_city(posed, ref, config)
+        distance, _ = path.query(seen.points_city[:, :2], distance_upper_bound=_ASPHALT_FROM_PATH_M)
+        statistics.add(
+            seen.sweep.intensity,
+            seen.sweep.ring,
+            np.linalg.norm(seen.sweep.points_ego, axis=1),
+            seen.is_ground & np.isfinite(distance),
+        )
+    response = statistics.response()
+    if response is None:
+        _LOG.warning(
+            "%s: too little road near the driven path to normalize lidar intensity; it stays as it is.",
+            posed.drive.name,
+        )
+    return response
+
+
+def _made_tiles(tiles: VoxelTiles) -> Iterator[tuple[TileIndex, PointTile]]:
+    for index in tiles.tile_indices():
+        yield index, made_tile(tiles.voxels(index), tiles.grid)
+
+
+def made_tile(voxels: Voxels, grid: VoxelGrid) -> PointTile:
+    """The points of a tile and its ground, from the sums of its voxels."""
+    from hdmap_tools.point_map.point_map import TILE_MM
+    from hdmap_tools.point_map.thinning import intensity_of, is_ground_of
+
+    points_mm = grid.means_mm(voxels)
+    is_ground, cell = is_ground_of(voxels), grid.cells(voxels.key)
+    ground = smooth_ground(
+        points_mm[is_ground],
+        voxels.sums[is_ground, 0] / 64.0,
+        cell[is_ground],
+        (TILE_MM // grid.cell_mm) ** 2,
+    )
+    points_mm[is_ground, 2] = ground.height_mm
+    return PointTile(
+        np.rint(points_mm).astype(np.int32),
+        intensity_of(voxels),
+        voxels.sums[:, 5].astype(np.int32),
+        is_ground,
+        cell.astype(np.uint16),
+        ground.cells.astype(np.uint16),
+        np.rint(ground.cell_height_mm).astype(np.int32),
+        np.rint(ground.roughness_mm).astype(np.int32),
+        ground.cell_points.astype(np.int32),
+    )
+
+
+class _Counter:
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._done, self._total = progress, 0, total
+
+    def one_more(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._total)

@@ -1,0 +1,83 @@
+"""The point map that a drive is mapped with: opened, made on the way, or taken from a point cloud."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from hdmap_tools.config import Config
+from hdmap_tools.point_map.build import PosedDrive, Progress, build_point_map
+from hdmap_tools.point_map.point_map import PointMap
+from hdmap_tools.readers.drive import Drive
+
+_LOG = logging.getLogger(__name__)
+
+
+def with_points(
+    config: Config, drive: Drive, scratch: Path, progress: Progress | None = None
+) -> tuple[Config, Drive]:
+    """The configuration with a point map to read, and the drive at the poses it stands on.
+
+    Args:
+        config: As asked for; unchanged where no method needs points and none were given.
+        drive: The drive to be mapped.
+        scratch: Folder for a point map that must be made first; need not exist.
+        progress: Told of sweeps, if one is made.
+
+    Raises:
+        PointMapError: If the point map cannot be read or made, or lies elsewhere.
+        CRSMismatchError: If its frame is another one than the drive's.
+    """
+    association = config.association
+    if association.points is None and not association.needs_points:
+        return config, drive
+    path = association.points
+    if path is None:
+        _LOG.warning(
+            "No point map given: making one for this run; keep one with `hdmap points %s -o POINTS` and "
+            "give it with --points.",
+            drive.root,
+        )
+        path = scratch / "points"
+        path.mkdir(parents=True)
+        point_map = build_point_map(
+            posed_drives([drive], config),
+            path,
+            config.points,
+            max_pose_gap_s=config.drive.max_pose_gap_s,
+            progress=progress,
+        )
+    else:
+        point_map = PointMap.open(path)
+    frame = point_map.meta.frame
+    if frame.is_georeferenced and drive.frame.is_georeferenced:
+        drive.frame.require_same(frame)
+    elif frame.is_georeferenced or drive.frame.is_georeferenced:
+        _LOG.info("Only one of drive and point map knows its place; both are taken in one frame.")
+    point_map.require_overlap(
+        drive.trajectory, drive.name, max(association.clip_ahead_m, association.clip_across_m)
+    )
+    trajectory = point_map.trajectory_of(drive.id)
+    if trajectory is not None:
+        drive = replace(drive, trajectory=trajectory)
+    else:
+        _LOG.info(
+            "The point map has no poses of drive %s; the drive's own are taken in its frame.",
+            drive.id,
+        )
+    association = association.model_copy(update={"points": path})
+    return config.model_copy(update={"association": association}), drive
+
+
+def posed_drives(drives: Sequence[Drive], config: Config) -> list[PosedDrive]:
+    """Drives at refined poses, where `points.refine_poses` says so and registration found hold."""
+    if not config.points.refine_poses:
+        return [PosedDrive.as_given(drive) for drive in drives]
+    from hdmap_tools.point_map.refine_poses import refine_poses
+
+    return [
+        PosedDrive(drive, refined.trajectory, refined.is_changed)
+        for drive, refined in zip(drives, refine_poses(drives), strict=True)
+    ]
