@@ -1,0 +1,179 @@
+"""The pose graph: what the given poses say, joined with what registration says.
+
+Unknown is each pose's correction (shift and turn in city axes). The given poses'
+errors are taken as a Gauss-Markov process: neighbours share most of their error, and
+over long distances it wanders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.point_map.refine_config import RefineConfig
+from hdmap_tools.types import NDArrayFloat, NDArrayInt
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What is changed of poses: ``R' = exp(turn) R``, ``t' = t + shift``, city axes.
+
+    Attributes:
+        shifts: (S, 3) metres.
+        turns: (S, 3) rotation vectors, radians.
+    """
+
+    shifts: NDArrayFloat
+    turns: NDArrayFloat
+
+    @classmethod
+    def none(cls, count: int) -> Correction:
+        """For so many poses."""
+        return cls(np.zeros((count, 3)), np.zeros((count, 3)))
+
+    @property
+    def vectors(self) -> NDArrayFloat:
+        """(S, 6) shift, then turn."""
+        return np.concatenate([self.shifts, self.turns], axis=1)
+
+    def applied(
+        self, rotations: NDArrayFloat, translations: NDArrayFloat
+    ) -> tuple[NDArrayFloat, NDArrayFloat]:
+        """The poses (S, 3, 3), (S, 3) changed."""
+        return (
+            Rotation.from_rotvec(self.turns).as_matrix() @ rotations,
+            translations + self.shifts,
+        )
+
+    def plus(self, step: NDArrayFloat) -> Correction:
+        """Changed further by (S, 6)."""
+        turned = Rotation.from_rotvec(step[:, 3:]) * Rotation.from_rotvec(self.turns)
+        return Correction(self.shifts + step[:, :3], turned.as_rotvec())
+
+    def at(self, timestamps_ns: NDArrayInt, wanted_ns: NDArrayInt) -> Correction:
+        """Interpolated from the times of these (S,) to others; outside, the nearest one's."""
+        origin = timestamps_ns[0]
+        knots, query = (timestamps_ns - origin) / 1e9, (wanted_ns - origin) / 1e9
+        # Turns are fractions of a degree: interpolating their vectors is slerp to 1e-6 of them.
+        columns = [np.interp(query, knots, column) for column in self.vectors.T]
+        stacked = np.column_stack(columns)
+        return Correction(stacked[:, :3], stacked[:, 3:])
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Precision of a chain of corrections, whose mean is none.
+
+    Attributes:
+        own: (S, 6) diagonal of each pose's block.
+        next: (S, 6) diagonal of the block between each pose and the next of its drive;
+            zero at a drive's end.
+    """
+
+    own: NDArrayFloat
+    next: NDArrayFloat
+
+    def times(self, vectors: NDArrayFloat) -> NDArrayFloat:
+        """Precision times corrections (S, 6)."""
+        result: NDArrayFloat = self.own * vectors
+        result[:-1] += self.next[:-1] * vectors[1:]
+        result[1:] += self.next[:-1] * vectors[:-1]
+        return result
+
+    def cost(self, vectors: NDArrayFloat) -> float:
+        """Half the squared Mahalanobis length of corrections (S, 6)."""
+        return float((vectors * self.times(vectors)).sum() / 2)
+
+
+def sigmas(config: RefineConfig) -> NDArrayFloat:
+    """(6,) of one given pose, about its drift: metres, then radians."""
+    return np.repeat([config.noise_m, np.deg2rad(config.noise_deg)], 3)
+
+
+def drive_prior(trajectory: Trajectory, config: RefineConfig, *, is_reference: bool) -> Prior:
+    """What is assumed of the errors of one drive's poses.
+
+    Noise that forgets itself and drift that walks are joined into one Gauss-Markov
+    process that changes between neighbours as much as both together.
+
+    Args:
+        trajectory: Given poses at the sweeps' times.
+        config: Gives the sigmas.
+        is_reference: Its place as a whole is believed; other drives are aligned to it.
+    """
+    seconds = np.diff(trajectory.timestamps_ns) / 1e9
+    metres = np.linalg.norm(np.diff(trajectory.translations, axis=0), axis=1)
+    noise = sigmas(config)
+    drift = np.repeat([config.drift_m, np.deg2rad(config.drift_deg)], 3)
+    forgotten = -np.expm1(-seconds / config.noise_correlation_s)
+    change = 2 * noise**2 * forgotten[:, None] + drift**2 * metres[:, None] / 100.0
+    spread = noise**2 + drift**2 * max(trajectory.length_m, 100.0) / 100.0
+    if not is_reference:
+        between = (config.between_drives_m, np.deg2rad(config.between_drives_deg))
+        spread = spread + np.repeat(between, 3) ** 2
+    memory = np.clip(1 - change / (2 * spread), 0.0, 1 - 1e-9)
+    innovation = 1 / (spread * (1 - memory**2))
+    own = np.zeros((len(trajectory), 6))
+    own[0] = 1 / spread
+    own[1:] += innovation
+    own[:-1] += memory**2 * innovation
+    after = np.zeros((len(trajectory), 6))
+    after[:-1] = -memory * innovation
+    return Prior(own, after)
+
+
+def joined_priors(priors: list[Prior]) -> Prior:
+    """Of several drives, one after another."""
+    return Prior(np.concatenate([p.own for p in priors]), np.concatenate([p.next for p in priors]))
+
+
+def solve(
+    prior: Prior,
+    rows: NDArrayInt,
+    columns: NDArrayInt,
+    blocks: NDArrayFloat,
+    gradient: NDArrayFloat,
+) -> NDArrayFloat:
+    """The step (S, 6) that the normal equations ask for.
+
+    Args:
+        prior: Adds its precision.
+        rows: (B,) of the blocks, not above `columns`.
+        columns: (B,).
+        blocks: (B, 6, 6) upper half of the registration's information.
+        gradient: (S, 6) of registration and prior together.
+    """
+    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse.linalg import splu
+
+    size = gradient.size
+    inside = np.arange(6)
+    at_row = np.broadcast_to(6 * rows[:, None, None] + inside[:, None], blocks.shape)
+    at_column = np.broadcast_to(6 * columns[:, None, None] + inside, blocks.shape)
+    is_off = rows != columns
+    matrix = coo_matrix(
+        (
+            np.concatenate([blocks.ravel(), blocks[is_off].ravel()]),
+            (
+                np.concatenate([at_row.ravel(), at_column[is_off].ravel()]),
+                np.concatenate([at_column.ravel(), at_row[is_off].ravel()]),
+            ),
+        ),
+        shape=(size, size),
+    ).tocsc()
+    beside = prior.next.ravel()[:-6]
+    matrix = matrix + diags([prior.own.ravel(), beside, beside], [0, 6, -6], format="csc")
+    # Metres and radians in one scale, so that pivots on the diagonal are sound.
+    scale = 1 / np.sqrt(matrix.diagonal())
+    scaling = diags([scale], [0], format="csc")
+    factor = splu(
+        (scaling @ matrix @ scaling).tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    step: NDArrayFloat = -(scale * factor.solve(scale * gradient.ravel())).reshape(-1, 6)
+    return step

@@ -1,0 +1,438 @@
+"""Refine the poses of drives: register their sweeps to the map they make, and solve a pose graph.
+
+Sweeps a metre or two apart (keyframes) of all drives make the map: pieces of plane
+surface. Each pass cuts the map anew from the poses found so far and solves for all
+keyframes at once, so that a place seen twice closes a loop and drives of one place are
+aligned to one another without a step of their own. Then every sweep is registered to
+the finished map. What the scene does not hold keeps the given poses.
+
+Why all at once, and not one sweep after another: see `RefineConfig.passes` and the
+measurements in the tests; a chain of registrations to what came before drifts, and a
+factor between a sweep and a map made of many others has no single pose at its other end.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from hdmap_tools.errors import CRSMismatchError, PointMapError
+from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.point_map.pose_graph import (
+    Correction,
+    Prior,
+    drive_prior,
+    joined_priors,
+    sigmas,
+    solve,
+)
+from hdmap_tools.point_map.refine_config import RefineConfig, RefineReport
+from hdmap_tools.point_map.registration import (
+    DIRECTIONS,
+    Observations,
+    SurfaceMap,
+    SweepPoints,
+    find_surfaces,
+    held_directions,
+    jacobians,
+    observe_known,
+    thin_sweep,
+    variances,
+)
+from hdmap_tools.readers.drive import Drive, SweepRef
+from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
+
+_log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
+"""Told how many sweeps of how many are done."""
+
+_MAX_KEYFRAMES: Final = 4000
+_VISIT_M: Final = 50.0
+"""Sweeps within so many metres of driving are one visit: their poses agree but for noise."""
+
+_MIN_SURFACES: Final = 30
+_MAX_POSE_GAP_S: Final = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """What refinement made of one drive's poses.
+
+    Attributes:
+        drive_id: Of the drive.
+        trajectory: At the very times of the drive's own.
+        is_changed: False if it is the drive's own.
+        report: What was done and why.
+    """
+
+    drive_id: str
+    trajectory: Trajectory
+    is_changed: bool
+    report: RefineReport
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Chosen sweeps of all drives, one drive after another."""
+
+    refs: list[tuple[Drive, SweepRef]]
+    rotations: NDArrayFloat
+    translations: NDArrayFloat
+    visits: NDArrayInt
+    prior: Prior
+
+
+def refine_poses(
+    drives: Sequence[Drive], config: RefineConfig | None = None, progress: Progress | None = None
+) -> list[RefinedPoses]:
+    """Refine the poses of drives of one place.
+
+    Args:
+        drives: In one city frame. The first one's place is believed; the others are
+            aligned to it.
+        config: Defaults if None.
+        progress: Told after each sweep read.
+
+    Returns:
+        One for each drive, in order.
+
+    Raises:
+        PointMapError: If there is no drive, or two are one and the same.
+        CRSMismatchError: If their city frames differ.
+    """
+    config = config or RefineConfig()
+    start = time.perf_counter()
+    _check(drives)
+    used = [_sweeps_with_pose(drive) for drive in drives]
+    chosen = [_keyframes(drive, refs, config) for drive, refs in zip(drives, used, strict=True)]
+    total = sum(map(len, used)) + sum(map(len, chosen))
+    done = 0
+
+    def read(drive: Drive, ref: SweepRef) -> tuple[NDArrayFloat, NDArrayFloat]:
+        nonlocal done
+        points, weights = thin_sweep(drive.read_sweep(ref).points_ego, config)
+        done += 1
+        if progress is not None:
+            progress(done, total)
+        return points, weights
+
+    place = _place(drives, chosen, config)
+    thinned = [read(drive, ref) for drive, ref in place.refs]
+    correction, surfaces = _refine_keyframes(place, SweepPoints.joined(thinned), config)
+    del thinned
+    results = []
+    first = 0
+    for index, (drive, refs, keys) in enumerate(zip(drives, used, chosen, strict=True)):
+        part = slice(first, first + len(keys))
+        first += len(keys)
+        own = Correction(correction.shifts[part], correction.turns[part])
+        results.append(
+            _refine_sweeps(
+                drive, refs, keys, own, surfaces, config, read=read, is_reference=index == 0
+            )
+        )
+    seconds = time.perf_counter() - start
+    _log.info("Refined the poses of %d sweeps in %.1f s.", sum(map(len, used)), seconds)
+    return results
+
+
+def _check(drives: Sequence[Drive]) -> None:
+    if not drives:
+        raise PointMapError("No drive to refine the poses of; expected at least one.")
+    ids = [drive.id for drive in drives]
+    twice = sorted({name for name in ids if ids.count(name) > 1})
+    if twice:
+        raise PointMapError(
+            f"Drive {twice[0]} is given twice; each drive of a place may be given once."
+        )
+    for drive in drives[1:]:
+        if drive.frame != drives[0].frame:
+            raise CRSMismatchError(
+                f"Drives {drives[0].id} and {drive.id} have different city frames; refine "
+                "drives of one frame together, the others alone."
+            )
+
+
+def _sweeps_with_pose(drive: Drive) -> list[SweepRef]:
+    if not drive.sweeps:
+        return []
+    times = np.array([ref.timestamp_ns for ref in drive.sweeps], dtype=np.int64)
+    covered = drive.trajectory.covers(times, _MAX_POSE_GAP_S)
+    # Two sensors may share a time, and a chain needs one node for each.
+    first = np.diff(times, prepend=times[0] - 1) > 0
+    return [ref for ref, usable in zip(drive.sweeps, covered & first, strict=True) if usable]
+
+
+def _times(refs: Sequence[SweepRef]) -> NDArrayInt:
+    return np.array([ref.timestamp_ns for ref in refs], dtype=np.int64)
+
+
+def _given(drive: Drive, refs: Sequence[SweepRef]) -> Trajectory:
+    times = _times(refs)
+    return Trajectory(times, *drive.trajectory.interpolate_many(times))
+
+
+def _keyframes(drive: Drive, refs: list[SweepRef], config: RefineConfig) -> list[SweepRef]:
+    """Sweeps at least `keyframe_distance_m` apart."""
+    if not refs:
+        return []
+    driven = _driven(_given(drive, refs))
+    spacing = max(config.keyframe_distance_m, driven[-1] / _MAX_KEYFRAMES)
+    steps = np.floor(driven / spacing)
+    return [ref for ref, new in zip(refs, np.diff(steps, prepend=-1.0) > 0, strict=True) if new]
+
+
+def _driven(trajectory: Trajectory) -> NDArrayFloat:
+    """(S,) metres driven at each pose."""
+    steps = np.linalg.norm(np.diff(trajectory.translations, axis=0), axis=1)
+    result: NDArrayFloat = np.concatenate([[0.0], np.cumsum(steps)])
+    return result
+
+
+def _place(drives: Sequence[Drive], chosen: list[list[SweepRef]], config: RefineConfig) -> _Place:
+    refs: list[tuple[Drive, SweepRef]] = []
+    rotations, translations, visits, priors = [], [], [], []
+    next_visit = 0
+    for index, (drive, keys) in enumerate(zip(drives, chosen, strict=True)):
+        if not keys:
+            continue
+        given = _given(drive, keys)
+        refs += [(drive, ref) for ref in keys]
+        rotations.append(given.rotations)
+        translations.append(given.translations)
+        visits.append(next_visit + (_driven(given) / _VISIT_M).astype(np.int64))
+        next_visit = int(visits[-1][-1]) + 1
+        priors.append(drive_prior(given, config, is_reference=index == 0))
+    if not refs:
+        return _Place(
+            [],
+            np.zeros((0, 3, 3)),
+            np.zeros((0, 3)),
+            np.zeros(0, np.int64),
+            Prior(np.zeros((0, 6)), np.zeros((0, 6))),
+        )
+    return _Place(
+        refs,
+        np.concatenate(rotations),
+        np.concatenate(translations),
+        np.concatenate(visits),
+        joined_priors(priors),
+    )
+
+
+def _refine_keyframes(
+    place: _Place, points: SweepPoints, config: RefineConfig
+) -> tuple[Correction, SurfaceMap]:
+    """Solve for all keyframes at once, as often as `passes` says; the map of the last poses."""
+    correction = Correction.none(len(place.refs))
+    for index in range(config.passes):
+        surfaces, seen, poses = _cut(place, points, correction, index, config)
+        if len(surfaces) < _MIN_SURFACES:
+            break
+        step = _joint_step(place, correction, poses, surfaces, seen, _robust_m(index), config)
+        correction = correction.plus(step)
+        _log.debug(
+            "Pass %d: %d surfaces, %d observations, RMS step %.4f m.",
+            index,
+            len(surfaces),
+            len(seen.sweep),
+            float(np.sqrt((step[:, :3] ** 2).sum(axis=1).mean())),
+        )
+    surfaces, seen, _ = _cut(place, points, correction, config.passes, config)
+    return correction, _without_outliers(surfaces, seen, config)
+
+
+def _without_outliers(surfaces: SurfaceMap, seen: Observations, config: RefineConfig) -> SurfaceMap:
+    """The surfaces moved along their normals to where most sweeps saw them."""
+    _, _, offsets = _weighed(surfaces, seen, _robust_m(config.passes), config)
+    return replace(surfaces, means=surfaces.means + surfaces.normals * offsets[:, None])
+
+
+def _weighed(
+    surfaces: SurfaceMap, seen: Observations, robust_m: float, config: RefineConfig
+) -> tuple[NDArrayFloat, NDArrayFloat, NDArrayFloat]:
+    """How far observations (O,) lie off their planes, robust weights (O,), offsets (V,)."""
+    from hdmap_tools.point_map.surfel_kernels import weigh
+
+    normals, means = surfaces.normals[seen.surface], surfaces.means[seen.surface]
+    off = np.einsum("ij,ij->i", normals, seen.means - means)
+    weights, offsets = weigh(seen.starts, off, 1 / variances(seen.counts, config), robust_m)
+    return off, weights, offsets
+
+
+def _robust_m(index: int) -> float:
+    """Residual from which an observation counts less; smaller once the poses agree."""
+    return max(0.3 * 0.5**index, 0.05)
+
+
+def _cut(
+    place: _Place, points: SweepPoints, correction: Correction, index: int, config: RefineConfig
+) -> tuple[SurfaceMap, Observations, NDArrayFloat]:
+    """Surfaces, what saw them, and positions (S, 3), of the corrected poses."""
+    rotations, translations = correction.applied(place.rotations, place.translations)
+    points_city, _ = points.in_city(rotations, translations)
+    # The golden ratio's multiples never come back to the same faces.
+    shift = np.array([0.618, 0.382, 0.854]) * (index + 1) % 1.0
+    middle = np.round(place.translations.mean(axis=0)) if len(place.refs) else np.zeros(3)
+    surfaces, seen = find_surfaces(
+        points_city,
+        points.weights,
+        points.sweeps,
+        place.visits,
+        origin=middle + shift * config.surface_size_m,
+        thickness_m=max(0.07 - 0.015 * index, 0.04),
+        config=config,
+    )
+    return surfaces, seen, translations
+
+
+def _joint_step(
+    place: _Place,
+    correction: Correction,
+    positions: NDArrayFloat,
+    surfaces: SurfaceMap,
+    seen: Observations,
+    robust_m: float,
+    config: RefineConfig,
+) -> NDArrayFloat:
+    from hdmap_tools.point_map.surfel_kernels import assemble, informations, mark_pairs
+
+    count = len(place.refs)
+    normals = surfaces.normals[seen.surface]
+    arms = seen.means - positions[seen.sweep]
+    off, weights, offsets = _weighed(surfaces, seen, robust_m, config)
+    information = informations(
+        *(seen.starts, seen.sweep, seen.surface, arms, weights),
+        *(surfaces.normals, surfaces.tilts, count, False),
+    )
+    keep = held_directions(information, sigmas(config), config.min_information)
+    # A change c moves a point by J c; with J keep, only what is held counts.
+    rows = np.einsum("ok,okm->om", jacobians(normals, arms), keep[seen.sweep])
+    pairs = mark_pairs(seen.starts, seen.sweep, count)
+    at_row, at_column = np.nonzero(pairs >= 0)
+    numbers = pairs[at_row, at_column]
+    blocks, gradient = assemble(
+        *(seen.starts, seen.sweep, rows, weights, off - offsets[seen.surface]),
+        *(pairs, len(numbers)),
+    )
+    gradient += place.prior.times(correction.vectors)
+    return solve(place.prior, at_row, at_column, blocks[numbers], gradient)
+
+
+def _refine_sweeps(
+    drive: Drive,
+    refs: list[SweepRef],
+    keys: list[SweepRef],
+    correction: Correction,
+    surfaces: SurfaceMap,
+    config: RefineConfig,
+    *,
+    read: Callable[[Drive, SweepRef], tuple[NDArrayFloat, NDArrayFloat]],
+    is_reference: bool,
+) -> RefinedPoses:
+    """Register every sweep of a drive to the finished map, and smooth along the drive."""
+    start = time.perf_counter()
+    if len(surfaces) < _MIN_SURFACES or not refs:
+        reason = (
+            "no sweep has a pose"
+            if not refs
+            else f"only {len(surfaces)} pieces of plane surface were seen by several sweeps, "
+            f"expected at least {_MIN_SURFACES}"
+        )
+        report = RefineReport(num_sweeps=len(refs), num_keyframes=len(keys), reason=reason)
+        return RefinedPoses(drive.id, drive.trajectory, False, report)
+    given = _given(drive, refs)
+    prior = drive_prior(given, config, is_reference=is_reference)
+    current = correction.at(_times(keys), _times(refs))
+    information = np.zeros((len(refs), 6, 6))
+    gradient = np.zeros((len(refs), 6))
+    keep = np.zeros((len(refs), 6, 6))
+    is_registered: NDArrayBool = np.zeros(len(refs), dtype=bool)
+    rotations, translations = current.applied(given.rotations, given.translations)
+    for index, ref in enumerate(refs):
+        points, weights = read(drive, ref)
+        found = _register(points, weights, rotations[index], translations[index], surfaces, config)
+        if found is not None:
+            information[index], gradient[index], keep[index] = found
+            is_registered[index] = True
+    gradient += prior.times(current.vectors)
+    numbers = np.arange(len(refs))
+    refined = current.plus(solve(prior, numbers, numbers, information, gradient))
+    seconds = time.perf_counter() - start
+    held = _held_share(keep, given.rotations)
+    report = RefineReport(
+        num_sweeps=len(refs),
+        num_registered=int(is_registered.sum()),
+        num_keyframes=len(keys),
+        held=held,
+        seconds=seconds,
+    )
+    if max(held.values()) == 0.0:
+        report = report.model_copy(update={"reason": "the scene holds no direction of any sweep"})
+        return RefinedPoses(drive.id, drive.trajectory, False, report)
+    everywhere = refined.at(given.timestamps_ns, drive.trajectory.timestamps_ns)
+    trajectory = Trajectory(
+        drive.trajectory.timestamps_ns,
+        *everywhere.applied(drive.trajectory.rotations, drive.trajectory.translations),
+    )
+    report = report.model_copy(
+        update={
+            "correction_m": float(np.sqrt((refined.shifts**2).sum(axis=1).mean())),
+            "correction_deg": float(np.rad2deg(np.sqrt((refined.turns**2).sum(axis=1).mean()))),
+        }
+    )
+    return RefinedPoses(drive.id, trajectory, True, report)
+
+
+def _register(
+    points: NDArrayFloat,
+    weights: NDArrayFloat,
+    rotation: NDArrayFloat,
+    translation: NDArrayFloat,
+    surfaces: SurfaceMap,
+    config: RefineConfig,
+) -> tuple[NDArrayFloat, NDArrayFloat, NDArrayFloat] | None:
+    """Information (6, 6), gradient (6,) at the pose, and what is held (6, 6); None without surfaces."""
+    from hdmap_tools.point_map.surfel_kernels import informations
+
+    turned = points @ rotation.T
+    step = np.zeros(6)
+    for _ in range(2):
+        points_city = turned + np.cross(step[3:], turned) + translation + step[:3]
+        seen = observe_known(surfaces, points_city, weights, 0)
+        if len(seen.surface) < _MIN_SURFACES:
+            return None
+        normals = surfaces.normals[seen.surface]
+        arms = seen.means - translation - step[:3]
+        off = np.einsum("ij,ij->i", normals, seen.means - surfaces.means[seen.surface])
+        weighing = 1 / variances(seen.counts, config) / (1 + (off / _robust_m(9)) ** 2) ** 2
+        known = informations(
+            *(np.zeros(1, np.int64), seen.sweep, seen.surface, arms, weighing),
+            *(surfaces.normals, surfaces.tilts, 1, True),
+        )
+        keep = held_directions(known, sigmas(config), config.min_information)[0]
+        rows = jacobians(normals, arms) @ keep
+        information = (rows * weighing[:, None]).T @ rows
+        gradient = rows.T @ (weighing * off)
+        change = -np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ gradient
+        if not np.isfinite(change).all():
+            return None
+        step = step + change
+    # As seen from the pose that the step began at.
+    return information, -information @ step, keep
+
+
+def _held_share(keep: NDArrayFloat, rotations: NDArrayFloat) -> dict[str, float]:
+    """Share of the sweeps whose change in each of the vehicle's directions is held."""
+    turn = np.zeros((len(keep), 6, 6))
+    turn[:, :3, :3] = rotations
+    turn[:, 3:, 3:] = rotations
+    in_ego = turn.transpose(0, 2, 1) @ keep @ turn
+    shares = (np.einsum("skk->sk", in_ego) > 0.5).mean(axis=0)
+    return {name: float(share) for name, share in zip(DIRECTIONS, shares, strict=True)}
