@@ -26,6 +26,7 @@ Source:
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from collections.abc import Mapping, Sequence
@@ -35,7 +36,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from hdmap_tools.errors import CalibrationError, DriveError, PoseError, SweepError
+from hdmap_tools.errors import (
+    CalibrationError,
+    DriveError,
+    HDMapError,
+    PoseError,
+    SweepError,
+)
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
@@ -53,6 +60,10 @@ logger = logging.getLogger(__name__)
 LAYOUT: Final = "av2"
 POSES_FILE: Final = "city_SE3_egovehicle.feather"
 LIDAR: Final = "lidar"
+MAP_FRAME_FILE: Final = "map_frame.json"
+"""Not part of the layout: where a simulated log's city frame lies on earth."""
+TRUE_MAP_FILE: Final = "truth/vector_map.gpkg"
+"""Not part of the layout: the vector map that a simulated log drives through."""
 
 CITY_UTM_ZONE_LAT_LON: Final[Mapping[str, tuple[int, float, float]]] = {
     "ATX": (14, 30.27464237939507, -97.7404457407424),
@@ -125,7 +136,8 @@ def read_av2(
         )
     ]
     maps = tuple(sorted((log_dir / "map").glob("log_map_archive_*.json")))
-    frame = _map_frame(maps, warnings)
+    frame = _map_frame(log_dir, maps, warnings)
+    true_map = log_dir / TRUE_MAP_FILE
     for warning in warnings:
         logger.warning("%s: %s", log_dir.name, warning)
     return Drive(
@@ -143,7 +155,7 @@ def read_av2(
         sweeps=tuple(sweeps),
         # partial, not a closure: a drive can then be sent to another process.
         read_sweep=partial(read_av2_sweep, trajectory=None if is_compensated else trajectory),
-        reference_maps=maps,
+        reference_maps=(*maps, true_map) if true_map.is_file() else maps,
         warnings=tuple(warnings),
     )
 
@@ -352,7 +364,10 @@ def _timed_files(
     return sorted(timed.items())
 
 
-def _map_frame(maps: Sequence[Path], warnings: list[str]) -> MapFrame:
+def _map_frame(log_dir: Path, maps: Sequence[Path], warnings: list[str]) -> MapFrame:
+    given = log_dir / MAP_FRAME_FILE
+    if given.is_file():
+        return _read_map_frame(given)
     found = {match[1] for path in maps if (match := _CITY_IN_MAP_NAME.search(path.name))}
     if len(found) == 1 and (city := next(iter(found))) in CITY_UTM_ZONE_LAT_LON:
         zone, lat, lon = CITY_UTM_ZONE_LAT_LON[city]
@@ -363,3 +378,14 @@ def _map_frame(maps: Sequence[Path], warnings: list[str]) -> MapFrame:
         "so the place on earth is unknown; geographic exports need --origin LAT,LON[,ALT]"
     )
     return MapFrame()
+
+
+def _read_map_frame(path: Path) -> MapFrame:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return MapFrame.from_json(document)
+    except (HDMapError, ValueError, TypeError, RecursionError) as error:
+        raise DriveError(
+            f"{path} does not say where the city frame lies ({' '.join(str(error).split())}); write "
+            "the drive anew, or remove the file and give the place with --origin."
+        ) from error

@@ -11,6 +11,7 @@ from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.labels.label_set import LabelSet, load_label_set
 from hdmap_tools.readers.drive import Drive
+from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.segmentation.model_profile import (
     find_profile,
     profile_for,
@@ -27,6 +28,9 @@ from hdmap_tools.segmentation.segmenter import Segmenter
 
 _log = logging.getLogger(__name__)
 
+SIMULATED = "simulated"
+"""As a model: the true label images of a simulated drive, with errors."""
+
 _HOW_TO_GIVE = (
     "give a model with --model PATH (.onnx or .xml), or label images with --labels FOLDER "
     "--label-set NAME"
@@ -36,9 +40,10 @@ _HOW_TO_GIVE = (
 def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
     """The segmenter for a drive.
 
-    Label PNGs if a folder of them is given (their label set may lie in it), else the model given, else the one
-    model with a known profile in ``models/`` in the drive's folder, beside it,
-    or in the working directory.
+    Label PNGs if a folder of them is given (their label set may lie in it), else the
+    model given, where ``simulated`` puts errors on the true labels of a simulated drive,
+    else the one model with a known profile in ``models/`` in the drive's folder, beside
+    it, or in the working directory.
 
     Raises:
         ConfigError: If what is given does not exist or fit, or nothing is given
@@ -54,6 +59,13 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
             )
         label_set = label_set_of(config.labels, config.label_set)
         return PrecomputedSegmenter(config.labels, label_set, drive.cameras)
+    if config.model is not None and str(config.model) == SIMULATED:
+        return _simulated(config, drive)
+    if config.confusion is not None:
+        raise ConfigError(
+            f"segmentation.confusion ({config.confusion}) is what the simulated network errs by; give "
+            "it with --model simulated. The matrix to read the map with is --confusion."
+        )
     model = config.model
     if model is None:
         model = find_model(drive.root)
@@ -66,6 +78,20 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
             "out, or name it in a profile of your own."
         )
     return segmenter
+
+
+def _simulated(config: SegmentationConfig, drive: Drive) -> Segmenter:
+    from hdmap_tools.segmentation.simulated import TRUE_LABELS, SimulatedSegmenter
+
+    if config.profile is not None or config.label_set is not None:
+        raise ConfigError(
+            "The simulated network needs no profile and has the label set of the drive's true label "
+            "images; leave --profile and --label-set out."
+        )
+    matrix = None if config.confusion is None else ConfusionMatrix.load(config.confusion)
+    return SimulatedSegmenter(
+        drive.root / TRUE_LABELS, matrix, config.seed, drive.cameras, drive.trajectory
+    )
 
 
 def label_set_of(labels: Path, given: str | None) -> LabelSet:
