@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hdmap_tools.errors import ConfigError, LabelError, ShapeError, brief_problems
 from hdmap_tools.labels.label_set import (
@@ -19,7 +20,7 @@ from hdmap_tools.labels.label_set import (
     builtin_label_sets,
     load_label_set,
 )
-from hdmap_tools.types import NDArrayByte, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayInt
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,29 @@ class Agreement:
 
 
 @dataclass(frozen=True, eq=False)
+class RangeBand:
+    """Pixel counts of one band of distance.
+
+    Attributes:
+        min_m: Distance from the camera over level ground, metres, from here on;
+        max_m: and below this. Infinite in the last band, which also holds all pixels
+            at or above the horizon.
+        counts: (T, P) int64, as in `ConfusionMatrix`.
+    """
+
+    min_m: float
+    max_m: float
+    counts: NDArrayInt
+
+    @property
+    def name(self) -> str:
+        """In tables: ``10-20 m``, or ``40 m and beyond``."""
+        if np.isinf(self.max_m):
+            return f"{self.min_m:g} m and beyond"
+        return f"{self.min_m:g}-{self.max_m:g} m"
+
+
+@dataclass(frozen=True, eq=False)
 class ConfusionMatrix:
     """Pixel counts by true and predicted label.
 
@@ -49,15 +73,33 @@ class ConfusionMatrix:
         predicted_set: Labels of the columns (the network's).
         counts: (T, P) int64, rows true, columns predicted; read-only.
         source: What it was measured on, and how.
+        bands: The same counts by distance, nearest first, where that was measured;
+            they add up to the counts.
     """
 
     true_set: LabelSet
     predicted_set: LabelSet
     counts: NDArrayInt
     source: str = ""
+    bands: tuple[RangeBand, ...] = ()
 
     def __post_init__(self) -> None:
-        counts = np.asarray(self.counts)
+        object.__setattr__(self, "counts", self._checked(self.counts))
+        if not self.bands:
+            return
+        bands = tuple(RangeBand(b.min_m, b.max_m, self._checked(b.counts)) for b in self.bands)
+        edges = [bands[0].min_m, *(band.max_m for band in bands)]
+        touch = all(a.max_m == b.min_m for a, b in itertools.pairwise(bands))
+        if not touch or edges[0] != 0 or not (np.diff(edges[:-1]) > 0).all() or edges[-1] != np.inf:
+            raise LabelError(
+                f"Range bands must run from 0 without gaps to infinity, found {[b.name for b in bands]}."
+            )
+        if not np.array_equal(np.sum([band.counts for band in bands], axis=0), self.counts):
+            raise LabelError("The counts of the range bands do not add up to those of the whole.")
+        object.__setattr__(self, "bands", bands)
+
+    def _checked(self, given: NDArrayAny) -> NDArrayInt:
+        counts = np.asarray(given)
         expected = (len(self.true_set), len(self.predicted_set))
         about = f"Confusion matrix {self.true_set.name!r} by {self.predicted_set.name!r}"
         if counts.shape != expected:
@@ -74,7 +116,7 @@ class ConfusionMatrix:
             )
         whole = counts.astype(np.int64)
         whole.flags.writeable = False
-        object.__setattr__(self, "counts", whole)
+        return whole
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -82,6 +124,11 @@ class ConfusionMatrix:
             and self.true_set == other.true_set
             and self.predicted_set == other.predicted_set
             and bool((self.counts == other.counts).all())
+            and self.range_edges_m == other.range_edges_m
+            and all(
+                bool((mine.counts == theirs.counts).all())
+                for mine, theirs in zip(self.bands, other.bands, strict=True)
+            )
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -93,6 +140,9 @@ class ConfusionMatrix:
         predicted_image: NDArrayByte,
         true_set: LabelSet,
         predicted_set: LabelSet,
+        *,
+        band_image: NDArrayByte | None = None,
+        range_edges_m: Sequence[float] = (),
     ) -> ConfusionMatrix:
         """Count the pixels of one image; those of id 255 on either side are left out.
 
@@ -101,6 +151,9 @@ class ConfusionMatrix:
             predicted_image: (height, width) uint8 ids of predicted_set.
             true_set: The annotation's labels.
             predicted_set: The network's labels.
+            band_image: (height, width) uint8 number of the band of distance that each
+                pixel is in (`range_bands.band_image`); None: distance is not told apart.
+            range_edges_m: Where those bands begin, from 0.
 
         Raises:
             ShapeError: If the images differ in size or are not (height, width) uint8.
@@ -118,10 +171,19 @@ class ConfusionMatrix:
         true_set.check(true_image, "The true label image")
         predicted_set.check(predicted_image, "The predicted label image")
         pairs = true_image.astype(np.int32) * 256 + predicted_image
-        joint = np.bincount(pairs.ravel(), minlength=256 * 256).reshape(256, 256)
+        number = 1
+        if band_image is not None:
+            number = len(range_edges_m)
+            if band_image.shape != shapes[0] or band_image.max(initial=0) >= number:
+                raise ShapeError(
+                    f"Range bands {band_image.shape} of {number} edges do not fit an image {shapes[0]}."
+                )
+            pairs += band_image.astype(np.int32) * (256 * 256)
+        joint = np.bincount(pairs.ravel(), minlength=number * 256 * 256).reshape(number, 256, 256)
         # Row and column 255, to be ignored, lie beyond any label set.
-        counts = joint[: len(true_set), : len(predicted_set)]
-        return cls(true_set, predicted_set, counts)
+        counts = joint[:, : len(true_set), : len(predicted_set)]
+        bands = () if band_image is None else _bands(range_edges_m, counts)
+        return cls(true_set, predicted_set, counts.sum(axis=0), bands=bands)
 
     def __add__(self, other: ConfusionMatrix) -> ConfusionMatrix:
         if self.true_set != other.true_set or self.predicted_set != other.predicted_set:
@@ -129,10 +191,39 @@ class ConfusionMatrix:
                 f"Confusion matrices of {self.true_set.name!r} by {self.predicted_set.name!r} and of "
                 f"{other.true_set.name!r} by {other.predicted_set.name!r} cannot be added."
             )
+        if self.range_edges_m != other.range_edges_m:
+            raise LabelError(
+                f"Confusion matrices of range bands {list(self.range_edges_m)} and "
+                f"{list(other.range_edges_m)} m cannot be added; measure both with the same ones."
+            )
         sources = dict.fromkeys(text for text in (self.source, other.source) if text)
         return ConfusionMatrix(
-            self.true_set, self.predicted_set, self.counts + other.counts, " + ".join(sources)
+            self.true_set,
+            self.predicted_set,
+            self.counts + other.counts,
+            " + ".join(sources),
+            tuple(
+                RangeBand(mine.min_m, mine.max_m, mine.counts + theirs.counts)
+                for mine, theirs in zip(self.bands, other.bands, strict=True)
+            ),
         )
+
+    @property
+    def range_edges_m(self) -> tuple[float, ...]:
+        """Where the range bands begin, metres; empty where there are none."""
+        return tuple(band.min_m for band in self.bands)
+
+    def of_band(self, index: int) -> ConfusionMatrix:
+        """The matrix of one range band alone."""
+        band = self.bands[index]
+        return ConfusionMatrix(
+            self.true_set, self.predicted_set, band.counts, f"{self.source} ({band.name})".strip()
+        )
+
+    def label_agreement(self) -> dict[str, Agreement]:
+        """Agreement of each label that both label sets have by the same name."""
+        shared = [name for name in self.true_set.names if name in self.predicted_set.names]
+        return {name: self.agreement([name], [name]) for name in shared}
 
     def agreement(self, true_names: Iterable[str], predicted_names: Iterable[str]) -> Agreement:
         """How well some predicted labels, taken together, cover some true ones.
@@ -186,10 +277,18 @@ class ConfusionMatrix:
             source=self.source,
             counts=(),
         ).model_dump(mode="json")
-        del document["counts"]
+        del document["counts"], document["bands"]
         head = json.dumps(document, indent=2, ensure_ascii=False)[:-2]
-        rows = ",\n".join(f"    {json.dumps(row)}" for row in self.counts.tolist())
-        return f'{head},\n  "counts": [\n{rows}\n  ]\n}}\n'
+        text = f'{head},\n  "counts": [\n{_rows(self.counts, 4)}\n  ]'
+        if self.bands:
+            each = [
+                f'    {{"min_m": {band.min_m:g}, "max_m": '
+                f"{'null' if np.isinf(band.max_m) else format(band.max_m, 'g')}, "
+                f'"counts": [\n{_rows(band.counts, 6)}\n    ]}}'
+                for band in self.bands
+            ]
+            text += ',\n  "bands": [\n' + ",\n".join(each) + "\n  ]"
+        return text + "\n}\n"
 
     @classmethod
     def from_json(cls, text: str, what: str = "The document") -> ConfusionMatrix:
@@ -228,8 +327,16 @@ class ConfusionMatrix:
             raise LabelError(f"{what}: its rows of counts differ in length.")
         try:
             counts = np.array(document.counts, dtype=np.int64)
-            return cls(sets[0], sets[1], counts, document.source)
-        except (LabelError, OverflowError) as error:
+            bands = tuple(
+                RangeBand(
+                    one.min_m,
+                    np.inf if one.max_m is None else one.max_m,
+                    np.array(one.counts, dtype=np.int64),
+                )
+                for one in document.bands
+            )
+            return cls(sets[0], sets[1], counts, document.source, bands)
+        except (LabelError, OverflowError, ValueError) as error:
             raise LabelError(f"{what}: {error}") from error
 
     @classmethod
@@ -255,6 +362,23 @@ class ConfusionMatrix:
             raise ConfigError(f"{path} is not a confusion matrix: {error}") from error
 
 
+class BandDocument(BaseModel):
+    """The counts of one band of distance.
+
+    Attributes:
+        min_m: Distance from the camera over level ground, from here on;
+        max_m: and below this; null in the last band, which holds all beyond, and all
+            pixels at or above the horizon.
+        counts: As those of the whole, which they are part of.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_m: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    max_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None
+    counts: tuple[tuple[int, ...], ...]
+
+
 class ConfusionDocument(BaseModel):
     """A confusion matrix on disk.
 
@@ -265,6 +389,7 @@ class ConfusionDocument(BaseModel):
         predicted_labels: Names of the columns.
         source: What it was measured on, and how.
         counts: Pixels; a row a true label, a column a predicted one.
+        bands: The same by distance, nearest first, where that was measured.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -276,13 +401,15 @@ class ConfusionDocument(BaseModel):
     predicted_labels: tuple[str, ...]
     source: str = ""
     counts: tuple[tuple[int, ...], ...]
+    bands: tuple[BandDocument, ...] = ()
 
 
 def find_confusion(label_set: LabelSet, model: str | None = None) -> ConfusionMatrix | None:
     """The shipped matrix of a model, by the name of its profile.
 
     Without a match by name, the one shipped matrix that predicts that label set:
-    label images on disk do not say which network made them.
+    label images on disk do not say which network made them. The matrix assumed for
+    the simulated network is known by that name only: it describes no other.
 
     Returns:
         The matrix, or None where none or several fit.
@@ -291,6 +418,7 @@ def find_confusion(label_set: LabelSet, model: str | None = None) -> ConfusionMa
     fitting = {name: m for name, m in matrices.items() if m.predicted_set == label_set}
     if model in fitting:
         return fitting[model]
+    fitting.pop("simulated", None)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
@@ -306,6 +434,18 @@ def _shipped() -> dict[str, str]:
 def _named_or_whole(label_set: LabelSet) -> Any:
     is_shipped = builtin_label_sets().get(label_set.name) == label_set
     return label_set.name if is_shipped else label_set
+
+
+def _bands(edges_m: Sequence[float], counts: NDArrayInt) -> tuple[RangeBand, ...]:
+    ends = [*edges_m[1:], np.inf]
+    return tuple(
+        RangeBand(float(a), float(b), part)
+        for a, b, part in zip(edges_m, ends, counts, strict=True)
+    )
+
+
+def _rows(counts: NDArrayInt, indent: int) -> str:
+    return ",\n".join(f"{' ' * indent}{json.dumps(row)}" for row in counts.tolist())
 
 
 def _ratio(part: int, whole: int) -> float:

@@ -60,9 +60,41 @@ def measure_confusion(
         ConfigError: If there is no pair.
         LabelError, ShapeError: If an id is outside its set, or sizes differ.
     """
+    labelled = ((truth, segment(image), None) for image, truth in pairs)
+    return confusion_of_pairs(labelled, true_set, predicted_set, (), source)
+
+
+def confusion_of_pairs(
+    pairs: Iterable[tuple[NDArrayByte, NDArrayByte, NDArrayByte | None]],
+    true_set: LabelSet,
+    predicted_set: LabelSet,
+    range_edges_m: Sequence[float] = (),
+    source: str = "",
+) -> ConfusionMatrix:
+    """Count true against predicted labels over pairs of label images.
+
+    Args:
+        pairs: True labels, predicted labels (both (height, width) uint8, 255 where
+            nothing is known), and the band of distance of each pixel or None.
+        true_set: Labels of the truth.
+        predicted_set: Labels of the network.
+        range_edges_m: Where the bands of distance begin; empty where there are none.
+        source: What the images are, kept with the matrix.
+
+    Raises:
+        ConfigError: If there is no pair.
+        LabelError, ShapeError: If an id is outside its set, or sizes differ.
+    """
     total: ConfusionMatrix | None = None
-    for image, truth in pairs:
-        one = ConfusionMatrix.measure(truth, segment(image), true_set, predicted_set)
+    for truth, predicted, band in pairs:
+        one = ConfusionMatrix.measure(
+            truth,
+            predicted,
+            true_set,
+            predicted_set,
+            band_image=band,
+            range_edges_m=range_edges_m,
+        )
         total = one if total is None else total + one
     if total is None:
         raise ConfigError("There is no annotated image to measure a confusion matrix on.")
@@ -76,7 +108,7 @@ def measure_confusion(
             ", ".join(f"{name} IoU {one.iou:.3f}" for name, one in agreed.items()) or "none shared",
             true_set.name,
         )
-    return ConfusionMatrix(true_set, predicted_set, total.counts, source)
+    return ConfusionMatrix(true_set, predicted_set, total.counts, source, total.bands)
 
 
 def confusion_from_folders(
