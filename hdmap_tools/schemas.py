@@ -17,7 +17,9 @@ from typing import Any, Final, Literal
 from pydantic import BaseModel
 
 from hdmap_tools.compare.mask_file import MaskSidecar
+from hdmap_tools.compare.paper import PaperScores
 from hdmap_tools.compare.raster import RasterComparison
+from hdmap_tools.compare.reliability import ReliabilityReport
 from hdmap_tools.config import SCHEMA_VERSION, Config
 from hdmap_tools.formats.atomic import atomic_output
 from hdmap_tools.formats.records import METADATA_VERSION
@@ -43,6 +45,8 @@ _MODELS: Final[tuple[tuple[str, type[BaseModel], int, _Mode], ...]] = (
     ("intensity_likelihood", IntensityDocument, 1, "validation"),
     ("mask", MaskSidecar, 1, "validation"),
     ("raster_comparison", RasterComparison, 1, "serialization"),
+    ("paper_scores", PaperScores, 1, "serialization"),
+    ("reliability", ReliabilityReport, 1, "serialization"),
     ("run_metrics", RunMetrics, 1, "serialization"),
 )
 

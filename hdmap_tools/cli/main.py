@@ -31,6 +31,7 @@ _COMMANDS: Final = {
     "export": "Write a vector map in another format.",
     "compare": "Hold a semantic map against a reference, where the map has evidence.",
     "confusion": "Measure a network's confusion matrix on annotated images.",
+    "reliability": "Hold a map's probabilities against truth, and fit the temperature that makes them true.",
     "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
     "simulate": "Drive through a map: images, lidar sweeps, poses, and their exact truth.",
     "info": "Say what a drive, a semantic map or a vector file holds.",
