@@ -5,6 +5,8 @@ Each is a mesh in its own frame: x along the road, y to the left, z up, the grou
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from hdmap_tools.simulate.materials import Mat
@@ -230,14 +232,13 @@ def hedge(length_m: float, height_m: float, rng: np.random.Generator) -> Mesh:
             faces += [(a, a + ring, b + ring), (a, b + ring, b)]
     for base, flip in ((0, 1), (n * ring, -1)):
         faces += [(base, base + j, base + j + 1)[::flip] for j in range(1, ring - 1)]
-    # The profile runs from −y over the top to +y, so these faces look inwards: turn them over.
-    return mesh_of(points.reshape(-1, 3), np.array(faces)[:, ::-1], int(Mat.HEDGE))
+    return mesh_of(points.reshape(-1, 3), np.array(faces), int(Mat.HEDGE))
 
 
 def barrier(xyz: NDArrayFloat, height_m: float, thick_m: float, foot_m: float, mat: Mat) -> Mesh:
     """Panels along a polyline (N, 3) on the ground, from foot_m up to height_m above it."""
     parts = []
-    for a, b in zip(xyz[:-1], xyz[1:], strict=True):
+    for a, b in itertools.pairwise(xyz):
         ahead = (b - a)[:2]
         length = float(np.linalg.norm(ahead))
         if length < 1e-6:

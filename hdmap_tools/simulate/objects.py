@@ -189,7 +189,7 @@ class RoadsideObjects:
             is_kept = rng.uniform() < (0.15 + 0.6 * wooded)
             height = float(rng.uniform(4.5, 12.0))
             nearest = _nearest(area, p)
-            if not is_kept:
+            if not is_kept or area.prepared.intersects(shapely.Point(p)):
                 continue
             if nearest is not None:
                 q, away, distance = nearest
