@@ -11,6 +11,7 @@ everywhere, byte for byte.
 import argparse
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,7 @@ class Osm:
         return self.ids.setdefault(key, len(self.ids) + 1)
 
     def node(self, x: float, y: float, height: float = 0.0) -> int:
+        """The node at a place."""
         key = ("node", round(float(x), 3) + 0.0, round(float(y), 3) + 0.0, height)
         if key not in self.ids:
             lat, lon = lat_lon(key[1], key[2])
@@ -62,28 +64,33 @@ class Osm:
         return self.ids[key]
 
     def relation(self, members: list[tuple[str, int, str]], tags: dict[str, str]) -> int:
+        """A new relation."""
         identifier = self._new(("relation", len(self.relations)))
         self.relations[identifier] = (members, tags)
         return identifier
 
     def lanelet(self, left: int, right: int, subtype: str, **tags: str) -> int:
+        """A lane between two ways."""
         both = "no" if subtype in ("walkway", "crosswalk") else "yes"
-        fixed = {"location": "urban", "one_way": both, "region": "de", "subtype": subtype}
+        fixed = {"location": "urban", "one_way": both, "subtype": subtype}
         members = [("way", left, "left"), ("way", right, "right")]
         return self.relation(members, {**fixed, "type": "lanelet", **tags})
 
     def area(self, outer: list[int], subtype: str, inner: list[int] | None = None) -> int:
+        """A polygon of ways that close."""
         members = [("way", w, "outer") for w in outer] + [("way", w, "inner") for w in inner or []]
         return self.relation(
             members, {"location": "urban", "subtype": subtype, "type": "multipolygon"}
         )
 
     def rule(self, subtype: str, members: list[tuple[str, int, str]], obeyed_by: list[int]) -> None:
+        """A regulatory element, and the lanelets it holds for."""
         rule = self.relation(members, {"subtype": subtype, "type": "regulatory_element"})
         for lanelet in obeyed_by:
             self.relations[lanelet][0].append(("relation", rule, "regulatory_element"))
 
     def text(self) -> str:
+        """The file."""
         lines = ["<?xml version='1.0' encoding='UTF-8'?>"]
         lines += ["<osm version='0.6' generator='hdmap_tools make_demo_town'>"]
         lines += [*self.nodes, *self.ways]
@@ -96,6 +103,7 @@ class Osm:
 
 
 def tags_xml(tags: dict[str, str]) -> str:
+    """Tags in the order of their names."""
     return "".join(f"<tag k='{k}' v='{v}'/>" for k, v in sorted(tags.items()))
 
 
@@ -167,10 +175,12 @@ class Path2D:
 
 
 def unit(angle: float) -> np.ndarray:
+    """The direction of an angle."""
     return np.array([math.cos(angle), math.sin(angle)])
 
 
 def wrap(angle: float) -> float:
+    """An angle within half a turn."""
     return math.remainder(angle, 2.0 * math.pi)
 
 
@@ -197,13 +207,16 @@ class Arm:
 
     @property
     def outward(self) -> float:
+        """Direction out of the junction."""
         heading = self.street.path.at(self.s)[1]
         return heading if self.sign > 0 else heading + math.pi
 
     def point(self, offset: float, is_inbound: bool) -> np.ndarray:
+        """A point of the gate, so far from the middle of the street."""
         return self.street.path.beside(self.s, offset * (self.sign if is_inbound else -self.sign))
 
     def lane_edges(self, lane: int, is_inbound: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Left and right end of a lane at the gate."""
         lanes = self.street.lanes
         left, right = lane * LANE, (lane + 1) * LANE
         if lane == -1:
@@ -245,6 +258,7 @@ class Street:
         self.begin, self.end = begin, end
 
     def line(self, begin: float, end: float, offset: float) -> np.ndarray:
+        """Points along the street at an offset."""
         return np.array([self.path.beside(s, offset) for s in self.path.stations(begin, end)])
 
     def _section(self, kind: str, begin: float, end: float, left: bool, right: bool) -> None:
@@ -277,7 +291,7 @@ class Street:
             walk = osm.way(outer, VIRTUAL)
             pair = (kerb_way, walk) if side < 0 else (walk, kerb_way)
             osm.lanelet(*pair, "walkway")
-            for lane, (inner, outside) in enumerate(zip(bounds, bounds[1:], strict=False)):
+            for lane, (inner, outside) in enumerate(pairwise(bounds)):
                 is_bicycle = lane == self.lanes
                 subtype = "bicycle_lane" if is_bicycle else "road"
                 made = osm.lanelet(inner, outside, subtype, speed_limit=self.limit)
@@ -331,6 +345,7 @@ class Street:
 
 
 def turn_of(a: Arm, b: Arm) -> float:
+    """How far one turns, left is positive, from one arm into another."""
     return wrap(b.outward - a.outward - math.pi)
 
 
@@ -460,6 +475,7 @@ def traffic_lights(osm: Osm, arms: list[Arm]) -> None:
 
 
 def park(osm: Osm, corners: list[tuple[float, float]]) -> None:
+    """An area of trees and grass."""
     osm.area([osm.way(np.array([*corners, corners[0]]), VIRTUAL)], "vegetation")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import shapely
@@ -13,7 +13,7 @@ import shapely
 from hdmap_tools.errors import WorldError
 from hdmap_tools.geometry.polyline import arc_lengths
 from hdmap_tools.simulate.route_search import RoadGraph, find_lanes
-from hdmap_tools.simulate.smooth_line import between, curvature, smoothed
+from hdmap_tools.simulate.smooth_line import between, smoothed
 from hdmap_tools.simulate.world_map import WorldMap
 from hdmap_tools.types import NDArrayFloat
 
@@ -25,6 +25,8 @@ MAX_LATERAL_MPS2: Final = 2.0
 MAX_ALONG_MPS2: Final = 1.5
 _MAX_START_DISTANCE_M: Final = 10.0
 _MAX_CHANGE_M: Final = 45.0
+_EASE_M: Final = 4.0
+"""Over which the acceleration changes; before and after a bend the speed is lower by as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +83,13 @@ def plan_route(world: WorldMap, length_m: float, start: str | None, seed: int) -
     else:
         lane_id, skipped_m = _start_lane(world, graph, start)
         starts = [lane_id]
-    lane_ids = find_lanes(graph, length_m + skipped_m + 1.0, starts, rng)
-    line, half_width_m = _joined(world, graph, lane_ids)
+    # Some more than wanted: smoothing cuts bends.
+    enough_m = skipped_m + 1.03 * length_m + 5.0
+    lane_ids = find_lanes(graph, enough_m, starts, rng)
+    line, half_width_m, begins_m = _joined(world, graph, lane_ids)
     along = arc_lengths(line)
-    kept = (along >= skipped_m) & (along <= skipped_m + length_m + 5.0)
-    found_m = float(along[-1] - skipped_m)
+    kept = (along >= skipped_m) & (along <= enough_m)
+    found_m = float(min(along[-1], enough_m) - skipped_m)
     if found_m < MIN_LENGTH_M or kept.sum() < 2:
         raise WorldError(
             f"The longest drive found in {world.name}"
@@ -94,12 +98,13 @@ def plan_route(world: WorldMap, length_m: float, start: str | None, seed: int) -
             "lanes. Choose another start, or check that the lanes of the map share end points."
         )
     xy = smoothed(line[kept], half_width_m[kept], STEP_M)
-    # Evenly spaced to a hair: smoothing shortens bends, and the wanted length ends between points.
-    along = arc_lengths(xy)
-    count = int(min(length_m, float(along[-1])) / STEP_M + 1e-9) + 1
+    driven = arc_lengths(xy)
+    count = int(min(length_m, float(driven[-1])) / STEP_M + 1e-9) + 1
     at = np.arange(count) * STEP_M
-    xy = np.column_stack([np.interp(at, along, xy[:, k]) for k in range(2)])
-    route = Route(xy, STEP_M, _driven_lanes(world, lane_ids, xy))
+    xy = np.column_stack([np.interp(at, driven, xy[:, k]) for k in range(2)])
+    end_m = skipped_m + found_m * min(at[-1] / float(driven[-1]), 1.0)
+    lane_ids = [k for k, begin_m in zip(lane_ids, begins_m, strict=True) if begin_m < end_m]
+    route = Route(xy, STEP_M, tuple(lane_ids))
     if route.length_m < length_m - STEP_M:
         logger.warning(
             "The drive through %s is %.0f m long instead of %.0f m: its lanes end there.",
@@ -146,23 +151,33 @@ def _start_lane(world: WorldMap, graph: RoadGraph, start: str) -> tuple[str, flo
 
 def _joined(
     world: WorldMap, graph: RoadGraph, lane_ids: Sequence[str]
-) -> tuple[NDArrayFloat, NDArrayFloat]:
-    """Middle of the lanes (N, 2) in driving order, and half their width (N,)."""
-    lines, widths = [], []
-    k = 0
+) -> tuple[NDArrayFloat, NDArrayFloat, list[float]]:
+    """Middle of the lanes (N, 2) in driving order, half their width (N,), where each begins.
+
+    A lane that is changed to begins where the change does.
+    """
+    lines: list[NDArrayFloat] = []
+    widths: list[NDArrayFloat] = []
+    begins_m: list[float] = []
+    driven_m, k = 0.0, 0
     while k < len(lane_ids):
         here = world.lanes[lane_ids[k]]
         middle, half_width = between(here.left, here.right)
         following = lane_ids[k + 1] if k + 1 < len(lane_ids) else None
+        if lines:
+            driven_m += float(np.hypot(*(middle[0] - lines[-1][-1])))
+        begins_m.append(driven_m)
         is_change = following in graph.changes[here.id] and following not in here.successors
         if following is not None and is_change:
             other = world.lanes[following]
             middle, half_width = _changing(middle, half_width, *between(other.left, other.right))
+            begins_m.append(driven_m)
             k += 1
         lines.append(middle)
         widths.append(half_width)
+        driven_m += float(arc_lengths(middle)[-1])
         k += 1
-    return np.concatenate(lines), np.concatenate(widths)
+    return np.concatenate(lines), np.concatenate(widths), begins_m
 
 
 def _changing(
@@ -188,11 +203,6 @@ def _changing(
     return mixed[:, :2], mixed[:, 2]
 
 
-def _driven_lanes(world: WorldMap, lane_ids: Sequence[str], xy: NDArrayFloat) -> tuple[str, ...]:
-    """The lanes as far as the line goes."""
-    return tuple(lane_ids)
-
-
 def motion_along(
     route: Route, speed_mps: float, rate_hz: float
 ) -> tuple[NDArrayFloat, NDArrayFloat]:
@@ -215,14 +225,13 @@ def motion_along(
             f"Speed and rate must be positive, found {speed_mps:g} m/s and {rate_hz:g} Hz."
         )
     step = route.step_m
-    bend = np.abs(curvature(route.xy))
-    squared = np.minimum(speed_mps**2, MAX_LATERAL_MPS2 / np.maximum(bend, 1e-9))
+    squared = np.minimum(speed_mps**2, MAX_LATERAL_MPS2 / np.maximum(_bend(route), 1e-9))
     # v² changes by at most 2·a·ds; lower envelope of cones of that slope, forward then back.
     ramp = 2.0 * MAX_ALONG_MPS2 * step * np.arange(len(squared))
     squared = np.minimum.accumulate(squared - ramp) + ramp
     squared = (np.minimum.accumulate((squared - ramp[::-1])[::-1]) + ramp)[::-1]
     # Lowest within a reach, then the mean over it: neither steeper nor above what it was.
-    squared = _mean_of_lowest(squared, reach=max(round(2.0 / step), 1))
+    squared = _mean_of_lowest(squared, reach=max(round(_EASE_M / step), 1))
     speed = np.sqrt(squared)
     taken_s = 2.0 * step / (speed[:-1] + speed[1:])
     at_s = np.concatenate([[0.0], np.cumsum(taken_s)])
@@ -248,8 +257,24 @@ def places_along(route: Route, arc_m: NDArrayFloat) -> tuple[NDArrayFloat, NDArr
 
     The rear axle follows the line, so the yaw is the direction of its tangent.
     """
-    from scipy.interpolate import CubicSpline
-
-    spline = CubicSpline(np.arange(len(route.xy)) * route.step_m, route.xy)
+    spline = _spline(route)
     tangent = spline(arc_m, 1)
     return spline(arc_m), np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
+
+
+def _bend(route: Route) -> NDArrayFloat:
+    """Largest curvature (N,), 1/m, of the driven curve about each of its points."""
+    spline = _spline(route)
+    at = np.linspace(0.0, route.length_m, 4 * (len(route.xy) - 1) + 1)
+    first, second = spline(at, 1), spline(at, 2)
+    cross = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    bend = cross / np.hypot(first[:, 0], first[:, 1]) ** 3
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(bend, 4, mode="edge"), 9)
+    return np.asarray(around.max(axis=1)[::4])
+
+
+def _spline(route: Route) -> Any:
+    """The curve through the route's points that the vehicle drives, by arc length."""
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(np.arange(len(route.xy)) * route.step_m, route.xy)

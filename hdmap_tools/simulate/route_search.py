@@ -8,15 +8,21 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import shapely
 
+from hdmap_tools.geometry.polyline import arc_lengths
 from hdmap_tools.simulate.smooth_line import between
-from hdmap_tools.simulate.world_map import LineKind, WorldLane, WorldMap
+from hdmap_tools.simulate.world_map import WorldLane, WorldMap
 
 MIN_CHANGE_M: Final = 25.0
 """Lanes shorter than this are not changed on."""
 _LOOK_AHEAD_M: Final = 400.0
 _MAX_STARTS: Final = 48
-_NEARLY_BEST: Final = 0.97
+_TRIES: Final = 3
+_AS_LONG: Final = 0.98
+_AS_GOOD: Final = 0.85
+_CROSSING_WORTH_M: Final = 20.0
+_BESIDE_WORTH: Final = 0.25
 
 
 @dataclass(frozen=True)
@@ -27,50 +33,70 @@ class RoadGraph:
         length_m: Of each lane's middle.
         successors: Lanes ahead.
         changes: Lanes beside, in the same direction, behind a dashed line.
+        sights_m: What a lane has to show, as metres of plain lane that weigh as much: 20 for
+            each crossing on it, a quarter of its length where it has a neighbour in its direction.
     """
 
     length_m: Mapping[str, float]
     successors: Mapping[str, tuple[str, ...]]
     changes: Mapping[str, tuple[str, ...]]
+    sights_m: Mapping[str, float]
 
     @classmethod
     def of_world(cls, world: WorldMap) -> RoadGraph:
         """Of a world's road lanes."""
         roads = {k: lane for k, lane in world.lanes.items() if lane.kind == "road"}
-        length_m = {}
-        for k, lane in roads.items():
-            middle, _ = between(lane.left, lane.right)
-            length_m[k] = float(np.hypot(*np.diff(middle, axis=0).T).sum())
+        middles = {k: between(lane.left, lane.right)[0] for k, lane in roads.items()}
+        length_m = {k: float(arc_lengths(middle)[-1]) for k, middle in middles.items()}
         length_m = {k: length for k, length in length_m.items() if length > 0.1}
         successors = {k: tuple(s for s in roads[k].successors if s in length_m) for k in length_m}
-        return cls(length_m, successors, _lane_changes(world, roads, length_m))
+        beside = _neighbours(roads, length_m)
+        crossings = shapely.STRtree(world.crosswalks)
+        sights_m = {}
+        for k, length in length_m.items():
+            crossed = crossings.query(shapely.LineString(middles[k]), predicate="intersects")
+            shown = _BESIDE_WORTH * length if beside[k] else 0.0
+            sights_m[k] = shown + _CROSSING_WORTH_M * len(crossed)
+        return cls(length_m, successors, _lane_changes(world, roads, length_m, beside), sights_m)
 
 
-def _lane_changes(
-    world: WorldMap, roads: Mapping[str, WorldLane], length_m: Mapping[str, float]
-) -> dict[str, tuple[str, ...]]:
-    paints = {
-        line.id: line.paint
-        for line in world.lines
-        if line.kind is LineKind.PAINT and line.paint is not None
-    }
+def _neighbours(
+    roads: Mapping[str, WorldLane], length_m: Mapping[str, float]
+) -> dict[str, set[str]]:
+    """Lanes in the same direction that share a line of the map."""
     by_left: dict[str, list[str]] = {}
     for k in length_m:
         if (left_line := roads[k].left_line) is not None:
             by_left.setdefault(left_line, []).append(k)
-    changes: dict[str, set[str]] = {k: set() for k in length_m}
+    beside: dict[str, set[str]] = {k: set() for k in length_m}
     for k in length_m:
-        shared = roads[k].right_line
-        paint = paints.get(shared) if shared is not None else None
-        if paint is None or "dashed" not in paint.style.value or length_m[k] < MIN_CHANGE_M:
-            continue
-        for other in by_left.get(str(shared), ()):
+        for other in by_left.get(roads[k].right_line or "", ()):
             # The neighbour on the right runs the same way if the shared line does in both.
-            same = np.allclose(roads[k].right[0], roads[other].left[0], atol=0.1)
-            if same and length_m[other] >= MIN_CHANGE_M and other != k:
-                changes[k].add(other)
-                changes[other].add(k)
-    return {k: tuple(sorted(found)) for k, found in changes.items()}
+            if other != k and np.allclose(roads[k].right[0], roads[other].left[0], atol=0.3):
+                beside[k].add(other)
+                beside[other].add(k)
+    return beside
+
+
+def _lane_changes(
+    world: WorldMap,
+    roads: Mapping[str, WorldLane],
+    length_m: Mapping[str, float],
+    beside: Mapping[str, set[str]],
+) -> dict[str, tuple[str, ...]]:
+    """Neighbours that a dashed line lets one change to, on lanes long enough to do so."""
+    dashed = {
+        line.id for line in world.lines if line.paint is not None and "dashed" in line.paint.style
+    }
+
+    def may_change(k: str, other: str) -> bool:
+        shared = {roads[k].left_line, roads[k].right_line} & {
+            roads[other].left_line,
+            roads[other].right_line,
+        }
+        return bool(shared & dashed) and min(length_m[k], length_m[other]) >= MIN_CHANGE_M
+
+    return {k: tuple(sorted(o for o in beside[k] if may_change(k, o))) for k in length_m}
 
 
 def find_lanes(
@@ -78,9 +104,10 @@ def find_lanes(
 ) -> list[str]:
     """The lanes of one of the best drives from any of the starts.
 
-    Drives are compared by how long they become (up to `length_m`), then by how much of them
-    is new road. From each start some are tried: at every fork the lane driven least, from
-    which the drive can go on long enough, with the most new road ahead.
+    Drives are compared by how long they become (up to `length_m`), how much of them is new
+    road, and what there is to see. From each start some are tried: at every fork a lane
+    driven least, from which the drive can go on long enough; the first time the one with
+    the most new road ahead.
 
     Args:
         graph: Lanes that can be driven.
@@ -94,14 +121,16 @@ def find_lanes(
     """
     reach_m = _reach(graph, length_m)
     order = [starts[k] for k in rng.permutation(len(starts))]
-    order.sort(key=lambda k: -round(reach_m[k]))
+    order.sort(key=lambda k: -round(min(reach_m[k], length_m)))
     found = []
     for start in order[:_MAX_STARTS]:
-        lanes = _drive(graph, length_m, start, reach_m, rng)
-        driven, new = _measure(graph, lanes, length_m)
-        found.append((driven + 0.5 * new, lanes))
-    best = max(score for score, _ in found)
-    return next(lanes for score, lanes in found if score >= _NEARLY_BEST * best)
+        for attempt in range(_TRIES):
+            lanes = _drive(graph, length_m, start, reach_m, rng, is_greedy=attempt == 0)
+            found.append((*_measure(graph, lanes, length_m), lanes))
+    longest = max(driven for driven, _, _ in found)
+    long = [(worth, lanes) for driven, worth, lanes in found if driven >= _AS_LONG * longest]
+    best = max(worth for worth, _ in long)
+    return next(lanes for worth, lanes in long if worth >= _AS_GOOD * best)
 
 
 def _reach(graph: RoadGraph, length_m: float) -> dict[str, float]:
@@ -136,6 +165,7 @@ def _drive(
     start: str,
     reach_m: Mapping[str, float],
     rng: np.random.Generator,
+    is_greedy: bool,
 ) -> list[str]:
     visits: Counter[str] = Counter([start])
     lanes = [start]
@@ -163,7 +193,7 @@ def _drive(
             range(len(enough)),
             key=lambda i: (
                 -visits[enough[i]],
-                round(_new_ahead(graph, enough[i], visits), -1),
+                round(_new_ahead(graph, enough[i], visits), -1) if is_greedy else 0.0,
                 tie[i],
             ),
         )
@@ -193,14 +223,15 @@ def _new_ahead(graph: RoadGraph, start: str, visits: Mapping[str, int]) -> float
 
 
 def _measure(graph: RoadGraph, lanes: Sequence[str], length_m: float) -> tuple[float, float]:
-    """Length driven, up to what is wanted, and how much of it for the first time."""
-    driven = new = 0.0
+    """Length driven, up to what is wanted, and what the drive is worth."""
+    driven = worth = 0.0
     seen: set[str] = set()
     for k, lane in enumerate(lanes):
-        is_change = k + 1 < len(lanes) and lanes[k + 1] in graph.changes[lane]
-        is_change = is_change and lanes[k + 1] not in graph.successors[lane]
+        following = lanes[k + 1] if k + 1 < len(lanes) else None
+        is_change = following in graph.changes[lane] and following not in graph.successors[lane]
         part = 0.0 if is_change else min(graph.length_m[lane], length_m - driven)
         driven += part
-        new += part if lane not in seen else 0.0
+        if lane not in seen:
+            worth += part + graph.sights_m[lane] * part / graph.length_m[lane]
         seen.add(lane)
-    return driven, new
+    return driven, driven + worth
