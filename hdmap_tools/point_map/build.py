@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hdmap_tools.association.ground import estimate_ground, near_ground
+from hdmap_tools.association.visibility import ring_gap_deg
 from hdmap_tools.config import PointsConfig
 from hdmap_tools.errors import PointMapError
 from hdmap_tools.geometry.se3 import SE3, Trajectory
@@ -35,6 +36,7 @@ from hdmap_tools.readers.drive import Drive, Sweep, SweepRef
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
 
 if TYPE_CHECKING:
+    from hdmap_tools.point_map.moving import SeenThrough
     from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, VoxelTiles
 
 _LOG = logging.getLogger(__name__)
@@ -43,6 +45,7 @@ Progress = Callable[[int, int], None]
 """Told how many sweeps of how many are done."""
 
 _SWEEPS_FOR_INTENSITY: Final = 60
+_SWEEPS_FOR_LIDAR: Final = 5
 _ASPHALT_FROM_PATH_M: Final = 2.5
 """Ground this near to the driven path is taken for road."""
 
@@ -72,13 +75,15 @@ class SweepInCity:
     """One sweep at its pose: returns within range, and which are ground.
 
     Attributes:
-        sweep: As read, only returns within range.
+        whole: As read.
+        sweep: Only returns within range.
         city_SE3_ego: Pose.
         points_city: (N, 3) metres.
         range_m: (N,) from the ego origin in x-y.
         is_ground: (N,).
     """
 
+    whole: Sweep
     sweep: Sweep
     city_SE3_ego: SE3
     points_city: NDArrayFloat
@@ -107,6 +112,7 @@ def build_point_map(
         PointMapError: If no drive has a sweep with a pose, or no ground is found.
         CRSMismatchError: If the drives have different frames.
     """
+    from hdmap_tools.point_map.moving import SeenThrough
     from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles
 
     if not drives:
@@ -164,21 +170,33 @@ def build_point_map(
                 for number, posed in enumerate(drives)
             ),
         )
+        seen_through = None
+        if config.remove_moving:
+            seen_through = SeenThrough(tiles)
+            for posed in drives:
+                refs = usable[posed.drive.id]
+                lidar_ego, gap_deg = _lidar(posed, refs)
+                for ref in refs:
+                    sweep = posed.drive.read_sweep(ref)
+                    pose = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
+                    seen_through.look(sweep, pose, lidar_ego, gap_deg)
+                    told.one_more()
         trajectories = {posed.drive.id: posed.trajectory for posed in drives}
-        return PointMap.create(folder, meta, _made_tiles(tiles), trajectories)
+        return PointMap.create(folder, meta, _made_tiles(tiles, seen_through), trajectories)
 
 
 def sweep_in_city(posed: PosedDrive, ref: SweepRef, config: PointsConfig) -> SweepInCity:
     """Read one sweep and put it where it was seen."""
-    sweep = posed.drive.read_sweep(ref)
-    city_SE3_ego = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
-    distance = np.linalg.norm(sweep.points_ego[:, :2], axis=1)
+    whole = posed.drive.read_sweep(ref)
+    city_SE3_ego = posed.trajectory.interpolate(whole.timestamp_ns, np.inf)
+    distance = np.linalg.norm(whole.points_ego[:, :2], axis=1)
     near = (distance <= config.max_range_m) & (distance >= config.min_range_m)
     sweep = Sweep(
-        sweep.timestamp_ns, sweep.points_ego[near], sweep.intensity[near], sweep.ring[near]
+        whole.timestamp_ns, whole.points_ego[near], whole.intensity[near], whole.ring[near]
     )
     surface = estimate_ground(sweep.points_ego, config.max_range_m)
     return SweepInCity(
+        whole,
         sweep,
         city_SE3_ego,
         city_SE3_ego.transform_from(sweep.points_ego),
@@ -238,9 +256,23 @@ def _intensity_response(
     return response
 
 
-def _made_tiles(tiles: VoxelTiles) -> Iterator[tuple[TileIndex, PointTile]]:
+def _lidar(posed: PosedDrive, refs: Sequence[SweepRef]) -> tuple[NDArrayFloat, float]:
+    """Where the lidar sits, (3,) in the ego frame, and the angle between its rings, degrees."""
+    from hdmap_tools.point_map.moving import estimate_lidar_position
+
+    some = [posed.drive.read_sweep(ref) for ref in refs[:: -(-len(refs) // _SWEEPS_FOR_LIDAR)]]
+    gaps = [ring_gap_deg(sweep.points_ego, sweep.ring) for sweep in some]
+    return estimate_lidar_position(some), float(np.median(gaps))
+
+
+def _made_tiles(
+    tiles: VoxelTiles, seen_through: SeenThrough | None
+) -> Iterator[tuple[TileIndex, PointTile]]:
     for index in tiles.tile_indices():
-        yield index, made_tile(tiles.voxels(index), tiles.grid)
+        voxels = tiles.voxels(index)
+        if seen_through is not None:
+            voxels = voxels.keep(~seen_through.is_moving(index, voxels))
+        yield index, made_tile(voxels, tiles.grid)
 
 
 def made_tile(voxels: Voxels, grid: VoxelGrid) -> PointTile:

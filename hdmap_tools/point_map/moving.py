@@ -1,0 +1,272 @@
+"""What moved leaves no trail in the point map: a voxel that a sweep saw through is not a surface.
+
+Each sweep is a picture of ranges around its lidar. A voxel in whose direction it
+measured further, and nothing as near, was empty at that time; one at whose range it
+measured was there. Ground is never asked: a grazing ray passes through a voxel of
+ground and meets the ground behind it.
+
+Source:
+    The comparison of map and range image follows Kim and Kim, Remove, then Revert:
+    Static Point Cloud Map Construction using Multiresolution Range Images, 2020.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numba import njit
+
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.point_map.point_map import TILE_MM, TileIndex
+from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, VoxelTiles, is_ground_of
+from hdmap_tools.readers.drive import Sweep
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayFloat32, NDArrayInt
+
+BLOCK_MM: Final = 200
+"""Voxels are judged in blocks of this edge: rays of a lidar pass 5 cm voxels by."""
+
+_BIN_DEG: Final = 0.125
+_COLUMNS: Final = int(360 / _BIN_DEG)
+_ROWS: Final = int(60 / _BIN_DEG)
+_LOWEST_DEG: Final = -40.0
+_MARGIN_M: Final = 0.3
+"""A return so near to a block's own range met it: half a block's diagonal and pose errors."""
+_THROUGH_M: Final = 0.05
+"""A ray that passes a block's middle so near went through it. The middle lies on the
+surface: rays further off pass above the roof of a parked car and beside a wall's end."""
+_REACH_M: Final = 40.0
+_NEAREST_M: Final = 2.5
+_FEWEST_THROUGH: Final = 2
+_THROUGH_PER_HIT: Final = 0.5
+"""Sweeps that saw through a block for each one that met it, from which it was not there to stay."""
+_TILES_IN_MEMORY: Final = 40
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Standing blocks of a tile.
+
+    Attributes:
+        of_voxel: (N,) block of each standing voxel of the tile.
+        column, layer: (M,) of each block: its x-y position as one number, its height.
+        centres_city: (M, 3) float32 metres from the tile's corner.
+    """
+
+    of_voxel: NDArrayInt
+    column: NDArrayInt
+    layer: NDArrayInt
+    centres_m: NDArrayFloat32
+
+    @classmethod
+    def of(cls, voxels: Voxels, grid: VoxelGrid) -> _Blocks:
+        """Blocks of a tile's standing voxels."""
+        standing = voxels.keep(~is_ground_of(voxels))
+        means_mm = grid.means_mm(standing)
+        x, y, z = np.floor(means_mm / BLOCK_MM).astype(np.int64).T
+        column = y * (TILE_MM // BLOCK_MM + 1) + x
+        key, of_voxel = np.unique(column * (1 << 24) + z + (1 << 23), return_inverse=True)
+        number = np.maximum(np.bincount(of_voxel, minlength=len(key)), 1)
+        centres = np.column_stack(
+            [np.bincount(of_voxel, means_mm[:, k], len(key)) / number / 1000.0 for k in range(3)]
+        )
+        layer = key % (1 << 24) - (1 << 23)
+        return cls(of_voxel, key >> 24, layer, centres.astype(np.float32))
+
+
+class SeenThrough:
+    """Counts by block how many sweeps met it, and how many saw through it."""
+
+    def __init__(self, tiles: VoxelTiles) -> None:
+        self._tiles = tiles
+        self._indices = set(tiles.tile_indices())
+        self._recent: OrderedDict[TileIndex, _Blocks] = OrderedDict()
+        self._counts: dict[TileIndex, NDArrayAny] = {}
+
+    def look(
+        self, sweep: Sweep, city_SE3_ego: SE3, lidar_ego: NDArrayFloat, gap_deg: float = 2.1
+    ) -> None:
+        """Hold a whole sweep against the blocks around it.
+
+        Args:
+            sweep: All its returns, near and far.
+            city_SE3_ego: Its pose.
+            lidar_ego: (3,) where its rays come from, ego frame, metres.
+            gap_deg: Angle between neighbouring rings.
+        """
+        image = _range_image(sweep.points_ego - lidar_ego)
+        city_SE3_lidar = city_SE3_ego @ SE3(np.eye(3), lidar_ego)
+        rotation = city_SE3_lidar.rotation
+        gap_rows = int(np.ceil(gap_deg / _BIN_DEG))
+        tile_m = TILE_MM / 1000.0
+        low, high = (
+            np.floor((city_SE3_lidar.translation[:2] + step) / tile_m).astype(int).tolist()
+            for step in (-_REACH_M, _REACH_M)
+        )
+        for x in range(low[0], high[0] + 1):
+            for y in range(low[1], high[1] + 1):
+                if (x, y) not in self._indices:
+                    continue
+                blocks = self._blocks((x, y))
+                counts = self._counts.setdefault(
+                    (x, y), np.zeros((2, len(blocks.layer)), dtype=np.uint16)
+                )
+                corner = np.array([x * tile_m, y * tile_m, 0.0])
+                origin = city_SE3_lidar.translation - corner
+                _compare(blocks.centres_m, origin, rotation, image, gap_rows, counts)
+
+    def is_moving(self, index: TileIndex, voxels: Voxels) -> NDArrayBool:
+        """(N,) which voxels of a tile are the trail of something that moved."""
+        moving = np.zeros(len(voxels), dtype=bool)
+        if index not in self._counts:
+            return moving
+        blocks = self._blocks(index)
+        hits, through = self._counts[index].astype(np.int64)
+        gone = (through >= _FEWEST_THROUGH) & (through >= _THROUGH_PER_HIT * hits)
+        gone = _with_tops(blocks, gone, hits, through)
+        moving[np.flatnonzero(~is_ground_of(voxels))] = gone[blocks.of_voxel]
+        return moving
+
+    def _blocks(self, index: TileIndex) -> _Blocks:
+        found = self._recent.pop(index, None)
+        if found is None:
+            found = _Blocks.of(self._tiles.voxels(index), self._tiles.grid)
+        self._recent[index] = found
+        while len(self._recent) > _TILES_IN_MEMORY:
+            self._recent.popitem(last=False)
+        return found
+
+
+def _with_tops(
+    blocks: _Blocks, gone: NDArrayBool, hits: NDArrayInt, through: NDArrayInt
+) -> NDArrayBool:
+    """Blocks (M,) that are gone, and those upon and under them that no ray could tell.
+
+    A lidar gets nothing back from the sky, so the upper part of a lorry is never seen
+    through; and a ray through its wheels meets the road at once. What touches something
+    gone from above or below and was seen for hardly longer goes too.
+    """
+    gone = gone.copy()
+    order = np.lexsort((blocks.layer, blocks.column))
+    below, above = order[:-1], order[1:]
+    touching = (blocks.column[below] == blocks.column[above]) & (
+        blocks.layer[above] - blocks.layer[below] <= 2
+    )
+    below, above = below[touching], above[touching]
+    known, asked = np.concatenate([below, above]), np.concatenate([above, below])
+    alike = (through[asked] < _FEWEST_THROUGH) & (hits[asked] <= 2 * hits[known] + 2)
+    known, asked = known[alike], asked[alike]
+    for _ in range(20):  # 4 m
+        more = gone[known] & ~gone[asked]
+        if not more.any():
+            break
+        gone[asked[more]] = True
+    return gone
+
+
+def estimate_lidar_position(sweeps: list[Sweep]) -> NDArrayFloat:
+    """Where a lidar sits, (3,) in the ego frame, metres: each of its lasers draws a cone around it.
+
+    Of several lidars, and while the vehicle moves, it is a middle. Without ring numbers, or
+    where the fit is no place on a vehicle: 1.8 m above the ego origin.
+    """
+    from scipy.optimize import least_squares
+
+    points, rings = [], []
+    for number, sweep in enumerate(sweeps):
+        distance = np.linalg.norm(sweep.points_ego, axis=1)
+        use = np.flatnonzero((distance > 4.0) & (distance < 60.0))
+        use = use[:: max(len(use) // 4000, 1)]
+        points.append(sweep.points_ego[use])
+        rings.append(sweep.ring[use].astype(np.int64) + 256 * number)
+    usual = np.array([0.0, 0.0, 1.8])
+    at, ring = np.concatenate(points), np.concatenate(rings)
+    _, ring = np.unique(ring, return_inverse=True)
+    number = np.bincount(ring)
+    if len(number) < 4 * len(sweeps):
+        return usual
+
+    def spread(position: NDArrayFloat) -> NDArrayFloat:
+        from_lidar = at - position
+        flat = np.hypot(from_lidar[:, 0], from_lidar[:, 1])
+        elevation = np.arctan2(from_lidar[:, 2], np.maximum(flat, 1e-6))
+        return np.asarray(elevation - (np.bincount(ring, elevation) / number)[ring])
+
+    fit = least_squares(spread, usual, loss="soft_l1", f_scale=0.002, max_nfev=60)
+    low, high = np.array([-3.0, -1.5, 0.5]), np.array([5.0, 1.5, 4.5])
+    return np.asarray(fit.x) if ((fit.x > low) & (fit.x < high)).all() else usual
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _range_image(from_lidar: NDArrayFloat) -> NDArrayFloat32:
+    """Nearest range by direction, (rows, columns); infinite where nothing came back."""
+    image = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)
+    for i in range(len(from_lidar)):
+        x, y, z = from_lidar[i]
+        distance = np.sqrt(x * x + y * y + z * z)
+        if distance < _NEAREST_M - 1.0:
+            continue
+        elevation = np.rad2deg(np.arctan2(z, np.sqrt(x * x + y * y)))
+        row = int((elevation - _LOWEST_DEG) / _BIN_DEG)
+        if row < 0 or row >= _ROWS:
+            continue
+        column = int((np.rad2deg(np.arctan2(y, x)) + 180.0) / _BIN_DEG) % _COLUMNS
+        if distance < image[row, column]:
+            image[row, column] = distance
+    return image
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _compare(
+    centres: NDArrayFloat32,
+    origin: NDArrayFloat,
+    rotation: NDArrayFloat,
+    image: NDArrayFloat32,
+    gap_rows: int,
+    counts: NDArrayAny,
+) -> None:
+    """Add a sweep to the counts (2, N): met, seen through.
+
+    The ray that went through must not be the one that just clears a roof: the ring on the
+    roof's side of it, below for what is lower than the lidar, must have gone further too.
+    """
+    half_m = BLOCK_MM / 2000.0
+    for i in range(len(centres)):
+        a, b, c = centres[i, 0] - origin[0], centres[i, 1] - origin[1], centres[i, 2] - origin[2]
+        distance = np.sqrt(a * a + b * b + c * c)
+        if distance > _REACH_M or distance < _NEAREST_M:
+            continue
+        x = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * c
+        y = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * c
+        z = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * c
+        flat = np.sqrt(x * x + y * y)
+        row = int((np.rad2deg(np.arctan2(z, flat)) - _LOWEST_DEG) / _BIN_DEG)
+        column = int((np.rad2deg(np.arctan2(y, x)) + 180.0) / _BIN_DEG)
+        tall = max(int(np.rad2deg(half_m / distance) / _BIN_DEG + 0.5), 1)
+        wide = max(int(np.rad2deg(half_m / max(flat, 0.1)) / _BIN_DEG + 0.5), 1)
+        tall_through = int(np.rad2deg(_THROUGH_M / distance) / _BIN_DEG + 0.5)
+        wide_through = int(np.rad2deg(_THROUGH_M / max(flat, 0.1)) / _BIN_DEG + 0.5)
+        if row < tall or row + tall >= _ROWS:
+            continue
+        nearest, through = np.inf, False
+        for r in range(row - tall, row + tall + 1):
+            for k in range(column - wide, column + wide + 1):
+                measured = image[r, k % _COLUMNS]
+                nearest = min(nearest, measured)
+                if abs(r - row) <= tall_through and abs(k - column) <= wide_through:
+                    through |= measured < np.inf
+            if nearest < distance - _MARGIN_M:
+                break
+        if nearest > distance + _MARGIN_M:
+            if not through:
+                continue
+            first = row - tall - gap_rows if z < 0.0 else row + tall + 1
+            for r in range(max(first, 0), min(first + gap_rows, _ROWS)):
+                for k in range(column - wide, column + wide + 1):
+                    nearest = min(nearest, image[r, k % _COLUMNS])
+            if nearest > distance + _MARGIN_M:
+                counts[1, i] = min(counts[1, i] + 1, 65535)
+        elif nearest >= distance - _MARGIN_M:
+            counts[0, i] = min(counts[0, i] + 1, 65535)
