@@ -15,7 +15,28 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def compiled(function: F) -> F:
     """Compile to machine code, kept on disk; the kernel lets other threads run."""
-    result: F = numba.njit(cache=True, nogil=True)(function)
+    result: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return result
+
+
+_FAST = {"contract", "arcp", "nsz", "reassoc", "afn"}
+
+
+def compiled_fast(function: F) -> F:
+    """The same for what is only looked at: sums may be reordered; infinities still hold."""
+    result: F = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)(function)
+    return result
+
+
+def compiled_inline(function: F) -> F:
+    """The same, written out where it is called.
+
+    An array handed to a compiled function is counted on the way in and out, atomically;
+    called for every pixel on two cores, that takes longer than the work.
+    """
+    result: F = numba.njit(
+        cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always"
+    )(function)
     return result
 
 

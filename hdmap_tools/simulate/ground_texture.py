@@ -6,15 +6,25 @@ marks flicker and vanish.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from hdmap_tools.simulate.materials import MATERIALS, Mat
 from hdmap_tools.simulate.scene import SurfaceRaster
-from hdmap_tools.types import NDArrayByte, NDArrayFloat32
+from hdmap_tools.types import NDArrayByte, NDArrayFloat32, NDArrayInt
 
-NUM_LEVELS = 8
+NUM_LEVELS: Final = 8
+PAINTS: Final = (
+    Mat.PAINT_WHITE,
+    Mat.PAINT_YELLOW,
+    Mat.ZEBRA_PAINT,
+    Mat.STOP_PAINT,
+    Mat.SYMBOL_PAINT,
+)
+"""Materials that wear off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +33,18 @@ class GroundTexture:
 
     Attributes:
         albedo: (256, 3) float32 linear, by material.
-        levels: Of cells 2, 4, 8 … times the raster's: (rows, cols, 3) uint8, the
-            square root of linear albedo times 255: finer steps where it is dark.
+        cells: (65536, 3) float32 the same by 256 times material plus wear: paint as far as it
+            is left, on asphalt.
+        pyramid: (B,) uint8: one after the other the levels, of cells 2, 4, 8 … times the
+            raster's, each (rows, cols, 3): the square root of linear albedo times 255, for
+            finer steps where it is dark.
+        level_shapes: (L, 3) where in `pyramid` each level begins, its rows, its columns.
     """
 
     albedo: NDArrayFloat32
-    levels: tuple[NDArrayByte, ...]
+    cells: NDArrayFloat32
+    pyramid: NDArrayByte
+    level_shapes: NDArrayInt
 
 
 def albedo_table() -> NDArrayFloat32:
@@ -39,22 +55,35 @@ def albedo_table() -> NDArrayFloat32:
     return table
 
 
+def _worn(albedo: NDArrayFloat32) -> NDArrayFloat32:
+    cells = np.repeat(albedo, 256, axis=0).reshape(256, 256, 3)
+    left = np.linspace(0.0, 1.0, 256, dtype=np.float32)[:, None]
+    for mat in PAINTS:
+        cells[mat] = left * albedo[mat] + (1 - left) * albedo[Mat.ASPHALT]
+    cells[Mat.GROUND] = albedo[Mat.GRASS]
+    return cells.reshape(-1, 3)
+
+
 def ground_texture(surface: SurfaceRaster) -> GroundTexture:
     """The texture of a surface raster; half a second for 100 million cells."""
     from hdmap_tools.simulate.compiled import in_bands
     from hdmap_tools.simulate.texture_kernels import first_level, next_level
 
     albedo = albedo_table()
+    cells = _worn(albedo)
+    shapes = []
+    start = 0
     rows, cols = surface.codes.shape
-    level = np.empty(((rows + 1) // 2, (cols + 1) // 2, 3), np.uint8)
+    for _ in range(NUM_LEVELS):
+        rows, cols = (rows + 1) // 2, (cols + 1) // 2
+        shapes.append((start, rows, cols))
+        start += 3 * rows * cols
+    pyramid = np.empty(start, np.uint8)
+    levels = [pyramid[s : s + 3 * r * c].reshape(r, c, 3) for s, r, c in shapes]
     in_bands(
-        lambda first, last: first_level(first, last, surface.codes, surface.wear, albedo, level),
-        len(level),
+        lambda first, last: first_level(first, last, surface.codes, surface.wear, cells, levels[0]),
+        len(levels[0]),
     )
-    levels = [level]
-    for _ in range(NUM_LEVELS - 1):
-        finer = levels[-1]
-        coarser = np.empty(((finer.shape[0] + 1) // 2, (finer.shape[1] + 1) // 2, 3), np.uint8)
+    for finer, coarser in itertools.pairwise(levels):
         next_level(0, len(coarser), finer, coarser)
-        levels.append(coarser)
-    return GroundTexture(albedo, tuple(levels))
+    return GroundTexture(albedo, cells, pyramid, np.array(shapes, dtype=np.int64))

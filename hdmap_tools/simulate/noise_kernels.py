@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from math import floor
 
-from hdmap_tools.simulate.compiled import compiled
+from hdmap_tools.simulate.compiled import compiled_fast
 
 
-@compiled
+@compiled_fast
 def hash_unit(x: int, y: int, z: int) -> float:
     """A number in 0..1 that follows from three integers and looks random."""
     h = (x * 374761393 + y * 668265263 + z * 2147483647) & 0xFFFFFFFF
@@ -16,7 +16,7 @@ def hash_unit(x: int, y: int, z: int) -> float:
     return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
 
 
-@compiled
+@compiled_fast
 def noise2(x: float, y: float, seed: int) -> float:
     """Smooth noise of the plane in -1..1, its lattice at whole numbers."""
     fx, fy = floor(x), floor(y)
@@ -31,7 +31,7 @@ def noise2(x: float, y: float, seed: int) -> float:
     return 2.0 * ((a + (b - a) * u) * (1.0 - v) + (c + (d - c) * u) * v) - 1.0
 
 
-@compiled
+@compiled_fast
 def noise3(x: float, y: float, z: float, seed: int) -> float:
     """Smooth noise of space in -1..1."""
     fz = floor(z)

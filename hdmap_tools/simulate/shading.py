@@ -8,21 +8,21 @@ from __future__ import annotations
 
 from math import exp, floor, log2, sqrt
 
-from hdmap_tools.simulate.compiled import compiled
+from hdmap_tools.simulate.compiled import compiled_fast, compiled_inline
 from hdmap_tools.simulate.light import Light
 from hdmap_tools.simulate.noise_kernels import hash_unit, noise2, noise3
 from hdmap_tools.simulate.texture_kernels import sample_texture
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
 MATTE, ASPHALT, PAINT, GLASS, LEAVES, LACQUER, PAVING, BRICK, LAWN = range(9)
 """How a material answers to light; `camera_image` says which does how."""
 
 _SKY = 255
-_MOST_TAPS = 8
+_MOST_TAPS = 6
 _SKY_COLOUR_OF_GROUND = 0.12
 
 
-@compiled
+@compiled_fast
 def sky_colour(dx: float, dy: float, dz: float, light: Light) -> tuple[float, float, float]:
     """Brightness of the sky in a unit direction; the far ground below the horizon."""
     up = max(dz, 0.0)
@@ -57,7 +57,7 @@ def sky_colour(dx: float, dy: float, dz: float, light: Light) -> tuple[float, fl
     return red, green, blue
 
 
-@compiled
+@compiled_fast
 def sun_rays(
     first: int,
     last: int,
@@ -80,7 +80,7 @@ def sun_rays(
             )
 
 
-@compiled
+@compiled_inline
 def _ground_albedo(
     x: float,
     y: float,
@@ -90,8 +90,9 @@ def _ground_albedo(
     along_m: float,
     codes: NDArrayByte,
     wear: NDArrayByte,
-    albedo: NDArrayFloat32,
-    levels: tuple[NDArrayByte, ...],
+    cells: NDArrayFloat32,
+    pyramid: NDArrayByte,
+    level_shapes: NDArrayInt,
     raster: NDArrayFloat,
 ) -> tuple[float, float, float]:
     """Mean albedo over a pixel's footprint: taps along its long axis, each as wide as its short one."""
@@ -99,7 +100,7 @@ def _ground_albedo(
     level = 0
     if fine > raster[0]:
         level = int(log2(fine / raster[0]) + 0.5)
-        level = min(max(level, 0), len(levels))
+        level = min(max(level, 0), len(level_shapes))
     cell = raster[0] * (1 << level)
     taps = min(max(int(along_m / max(fine, cell) + 0.5), 1), _MOST_TAPS)
     red = green = blue = 0.0
@@ -108,8 +109,9 @@ def _ground_albedo(
         r, g, b = sample_texture(
             codes,
             wear,
-            albedo,
-            levels,
+            cells,
+            pyramid,
+            level_shapes,
             raster,
             level,
             x + offset * toward_x,
@@ -121,13 +123,13 @@ def _ground_albedo(
     return red / taps, green / taps, blue / taps
 
 
-@compiled
+@compiled_fast
 def _grain(wavelength_m: float, footprint_m: float) -> float:
     """How much of a variation is left when a pixel averages over its footprint, 0..1."""
     return min(max(1.4 - 0.9 * footprint_m / wavelength_m, 0.0), 1.0)
 
 
-@compiled
+@compiled_fast
 def _ground_variation(x: float, y: float, footprint_m: float, amplitude: float, seed: int) -> float:
     """Factor on the albedo of asphalt, paving and paint: grain, blotches, a few cracks."""
     value = 0.0
@@ -151,7 +153,7 @@ def _ground_variation(x: float, y: float, footprint_m: float, amplitude: float, 
     return max(factor, 0.25)
 
 
-@compiled
+@compiled_fast
 def shade(
     first: int,
     last: int,
@@ -169,7 +171,9 @@ def shade(
     codes: NDArrayByte,
     wear: NDArrayByte,
     albedo: NDArrayFloat32,
-    levels: tuple[NDArrayByte, ...],
+    cells: NDArrayFloat32,
+    pyramid: NDArrayByte,
+    level_shapes: NDArrayInt,
     raster: NDArrayFloat,
     light: Light,
     image: NDArrayFloat32,
@@ -185,7 +189,7 @@ def shade(
         origin: (3,) of the scene, city frame: what varies is fixed in the city.
         focal_px: Of the camera.
         answers, texture: By material: how it answers to light, amplitude of its variation.
-        codes, wear, albedo, levels, raster: The ground's texture.
+        codes, wear, albedo, cells, pyramid, level_shapes, raster: The ground's texture.
         light: Light and air.
         image: Written.
     """
@@ -224,8 +228,9 @@ def shade(
                 along_m,
                 codes,
                 wear,
-                albedo,
-                levels,
+                cells,
+                pyramid,
+                level_shapes,
                 raster,
             )
         else:
@@ -339,7 +344,7 @@ def shade(
         image[i, 2] = blue * clear + light.haze[2] * (1.0 - clear)
 
 
-@compiled
+@compiled_fast
 def finish(
     first: int,
     last: int,
