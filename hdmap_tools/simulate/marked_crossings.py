@@ -14,19 +14,24 @@ MIN_APART_M: Final = 1.2
 MAX_APART_M: Final = 8.0
 _MAX_ANGLE_RAD: Final = np.radians(25.0)
 _MIN_OVERLAP: Final = 0.5
+_MIN_ON_ROAD: Final = 0.5
 
 
 def crossings_between(
-    lines: Sequence[NDArrayFloat], known: Sequence[shapely.Polygon]
+    lines: Sequence[NDArrayFloat],
+    known: Sequence[shapely.Polygon],
+    lanes: Sequence[shapely.Polygon],
 ) -> list[shapely.Polygon]:
     """The areas between lines that lie side by side, nearest pairs first; each line serves once.
 
     Two lines make a crossing if they run the same way within 25 degrees, lie 1.2 to 8 m
-    apart, and each lies beside at least half of the other.
+    apart, each lies beside at least half of the other, and at least half of the area between
+    them is lanes of vehicles: maps mark footpaths beside the road in the same way.
 
     Args:
         lines: (N, 2) each, metres.
         known: Crossings that exist already; areas that are mostly theirs are left out.
+        lanes: Valid polygons of the lanes for vehicles and bicycles.
 
     Returns:
         Convex polygons, sorted by their place.
@@ -42,11 +47,25 @@ def crossings_between(
     for _, i, j in sorted(pairs):
         if {i, j} & used:
             continue
-        used |= {i, j}
         area = shapely.convex_hull(shapely.MultiPoint(np.concatenate([lines[i], lines[j]])))
+        if not are_on_road([area], lanes, _MIN_ON_ROAD)[0]:
+            continue
+        used |= {i, j}
         if not any(area.intersection(other).area > 0.5 * area.area for other in known):
             found.append(area)
     return sorted(found, key=lambda area: area.bounds)
+
+
+def are_on_road(
+    areas: Sequence[shapely.Polygon], lanes: Sequence[shapely.Polygon], share: float = 0.1
+) -> list[bool]:
+    """Whether at least a share of each area is lanes."""
+    road = shapely.STRtree(lanes)
+    found = []
+    for area in areas:
+        near = shapely.union_all([lanes[k] for k in road.query(area)])
+        found.append(bool(near.intersection(area).area >= share * area.area))
+    return found
 
 
 def _distance_side_by_side(a: NDArrayFloat, b: NDArrayFloat) -> float | None:

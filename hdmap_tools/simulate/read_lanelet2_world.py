@@ -20,7 +20,7 @@ from hdmap_tools.formats.records import frame_around, parse_metadata
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.simulate.lane_links import Gate, bridge_gaps, successors_by_gate
 from hdmap_tools.simulate.lanelet2_lines import AREA_KINDS, line_of, speed_limit_mps
-from hdmap_tools.simulate.marked_crossings import crossings_between
+from hdmap_tools.simulate.marked_crossings import are_on_road, crossings_between
 from hdmap_tools.simulate.world_map import LaneKind, LineKind, WorldLane, WorldLine, WorldMap
 from hdmap_tools.types import NDArrayFloat
 
@@ -130,7 +130,16 @@ class _Reader:
                 self.left_out[f"lanelets for {subtype}"] += 1
         lines = self._lines()
         stop_lines, pairs = self._stop_lines_and_crossing_lines(crossing_ways)
-        crosswalks += crossings_between(pairs, crosswalks)
+        paved = [lane.polygon() for lane in lanes.values() if lane.kind != "walkway"]
+        # Footpaths and refuges of islands stand in real maps as crossings too; no zebra is there.
+        on_road = are_on_road(crosswalks, paved)
+        for crossing, is_on_road in zip(crosswalks, on_road, strict=True):
+            if not is_on_road:
+                areas.setdefault("sidewalk", []).append(crossing)
+        if num_beside := on_road.count(False):
+            _log.info("%s: took %d crossings beside the road for pavement", name, num_beside)
+        crosswalks = [c for c, is_on_road in zip(crosswalks, on_road, strict=True) if is_on_road]
+        crosswalks += crossings_between(pairs, crosswalks, paved)
         known = {line.id for line in lines}
         links = bridge_gaps(lanes, successors_by_gate(lanes, self._entries, self._exits))
         lanes = {

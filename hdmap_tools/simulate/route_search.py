@@ -167,7 +167,7 @@ def _drive(
     rng: np.random.Generator,
     is_greedy: bool,
 ) -> list[str]:
-    visits: Counter[str] = Counter([start])
+    visits: Counter[str] = Counter([_place(start)])
     lanes = [start]
     driven = graph.length_m[start]
     has_changed = False
@@ -182,7 +182,7 @@ def _drive(
             ]
             if better:
                 lanes.append(max(better, key=lambda k: (reach_m[k], k)))
-                visits[lanes[-1]] += 1
+                visits[_place(lanes[-1])] += 1
                 has_changed = True
                 continue
         if not options:
@@ -192,13 +192,13 @@ def _drive(
         chosen = max(
             range(len(enough)),
             key=lambda i: (
-                -visits[enough[i]],
+                -visits[_place(enough[i])],
                 round(_new_ahead(graph, enough[i], visits), -1) if is_greedy else 0.0,
                 tie[i],
             ),
         )
         lanes.append(enough[chosen])
-        visits[enough[chosen]] += 1
+        visits[_place(enough[chosen])] += 1
         driven += graph.length_m[enough[chosen]]
         has_changed = False
     return lanes
@@ -212,7 +212,7 @@ def _new_ahead(graph: RoadGraph, start: str, visits: Mapping[str, int]) -> float
     while stack and looks < 200:
         here, length, on_way = stack.pop()
         looks += 1
-        if visits.get(here, 0) or here in on_way:
+        if visits.get(_place(here), 0) or here in on_way:
             continue
         length += graph.length_m[here]
         best = max(best, length)
@@ -231,7 +231,12 @@ def _measure(graph: RoadGraph, lanes: Sequence[str], length_m: float) -> tuple[f
         is_change = following in graph.changes[lane] and following not in graph.successors[lane]
         part = 0.0 if is_change else min(graph.length_m[lane], length_m - driven)
         driven += part
-        if lane not in seen:
+        if _place(lane) not in seen:
             worth += part + graph.sights_m[lane] * part / graph.length_m[lane]
-        seen.add(lane)
+        seen.add(_place(lane))
     return driven, driven + worth
+
+
+def _place(lane: str) -> str:
+    """What a lane and the one against it on the same ground have in common."""
+    return lane.removesuffix("~")

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
+import numpy as np
 import shapely
 
 from hdmap_tools.geometry.map_frame import MapFrame
@@ -85,6 +86,13 @@ class WorldLane:
     left_line: str | None = None
     right_line: str | None = None
     speed_limit_mps: float | None = None
+
+    def polygon(self) -> shapely.Polygon | shapely.MultiPolygon:
+        """The ground between its bounds, valid; in parts where they cross."""
+        ring = np.concatenate([self.left, self.right[::-1]])
+        valid = shapely.make_valid(shapely.Polygon(ring))
+        parts = [p for p in shapely.get_parts(valid) if p.geom_type == "Polygon"]
+        return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
 
 
 @dataclass(frozen=True, eq=False)
