@@ -11,6 +11,7 @@ from hdmap_tools.errors import WorldError
 from hdmap_tools.geometry.polyline import arc_lengths
 from hdmap_tools.simulate.ground_mesh import base_mesh, far_mesh, raised_mesh
 from hdmap_tools.simulate.objects import RoadsideObjects
+from hdmap_tools.simulate.parked import parked_vehicles
 from hdmap_tools.simulate.road_area import WorldIndex
 from hdmap_tools.simulate.route import Route
 from hdmap_tools.simulate.scene import Actor, Mesh, Scene
@@ -70,6 +71,8 @@ class SceneBuilder:
         middle = (driven.min(axis=0) + driven.max(axis=0)) / 2
         height = float(self.terrain.height_at(middle[None])[0])
         origin = np.round(np.array([*middle, height]))
+        way = shapely.LineString(route.xy)
+        shapely.prepare(way)
         parts = [base_mesh(near, self.terrain, origin)]
         for tile in sorted(near):
             area = self.index.road_area(block_of_tile(*tile))
@@ -77,6 +80,9 @@ class SceneBuilder:
         for tile in sorted(far):
             corner = np.array([tile[0] * TILE_M, tile[1] * TILE_M, 0.0])
             mesh = self.objects.mesh(*tile)
+            if tile in near:
+                parked = parked_vehicles(self.index, self.terrain, self.settings, tile, way)
+                mesh = Mesh.merged([mesh, parked])
             shifted = mesh.vertices.astype(np.float64) + (corner - origin)
             parts.append(Mesh(shifted.astype(np.float32), mesh.triangles, mesh.materials))
         parts.append(self._horizon(driven, near, origin))

@@ -133,6 +133,8 @@ class RoadsideObjects:
             footprint = _rectangle(xy, yaw, width, depth)
             if shapely.distance(area.drivable, footprint) < min(setback - 1.5, 6.0):
                 continue
+            if any(footprint.distance(b) < 2.0 for b in self.index.world.areas.get("building", ())):
+                continue
             found.append(
                 Placed(footprint, xy, yaw, float(rng.uniform()), (*tile, k), (width, depth))
             )
@@ -148,9 +150,7 @@ class RoadsideObjects:
         ]
 
     def _buildings(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
-        if self.index.world.areas.get("building"):
-            return self._mapped_buildings(tile, corner)
-        meshes = []
+        meshes = self._mapped_buildings(tile, corner)
         for lot in self._accepted_lots(tile):
             rng = rng_at(self.settings.seed, Purpose.LOT, *lot.rng_place, 99)
             wall = _WALLS[int(rng.integers(len(_WALLS)))]
@@ -161,7 +161,7 @@ class RoadsideObjects:
     def _mapped_buildings(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
         """Buildings that the map knows, as blocks over their outline's rectangle."""
         meshes = []
-        for polygon in self.index.world.areas["building"]:
+        for polygon in self.index.world.areas.get("building", ()):
             centre = np.array([polygon.centroid.x, polygon.centroid.y])
             if tuple(np.floor(centre / TILE_M).astype(int)) != tile:
                 continue

@@ -137,7 +137,7 @@ class SurfaceTiles:
         noise = 0.75 * value_noise(xy, 22.0, seed, Purpose.GROUND_COVER)
         noise += 0.25 * value_noise(xy, 3.0, seed, Purpose.GROUND_COVER, 1)
         codes = np.full(len(xy), Mat.GRASS, dtype=np.uint8)
-        codes[noise > 0.70] = Mat.GRAVEL
+        codes[noise > 0.80] = Mat.GRAVEL
         codes[noise < 0.18] = Mat.SOIL
         small = codes.reshape(len(k), len(k))
         return np.repeat(np.repeat(small, repeat, axis=0), repeat, axis=1)
@@ -277,23 +277,7 @@ class SurfaceTiles:
     @cached_property
     def crossing_directions(self) -> list[NDArrayFloat]:
         """(2,) unit vector of each crossing along which vehicles drive over it."""
-        return [self._crossing_direction(c) for c in self.index.world.crosswalks]
-
-    def _crossing_direction(self, crossing: shapely.Polygon) -> NDArrayFloat:
-        total = np.zeros(2)
-        for lane in self.index.lanes_near(crossing):
-            centre = lane_centre(lane, 0.5)
-            steps = np.diff(centre, axis=0)
-            inside = shapely.intersects_xy(crossing, (centre[:-1] + centre[1:]) / 2)
-            # Opposite directions are one: doubled angles.
-            angle = 2 * np.arctan2(steps[inside, 1], steps[inside, 0])
-            total += [np.cos(angle).sum(), np.sin(angle).sum()]
-        if np.linalg.norm(total) < 0.5:  # no lane: the short side of the crossing
-            ring = shapely.get_coordinates(crossing.minimum_rotated_rectangle)[:3]
-            side = min(np.diff(ring, axis=0), key=lambda s: float(np.linalg.norm(s)))
-            return np.asarray(side / max(float(np.linalg.norm(side)), 1e-9))
-        angle = np.arctan2(total[1], total[0]) / 2
-        return np.array([np.cos(angle), np.sin(angle)])
+        return [crossing_direction(self.index, c) for c in self.index.world.crosswalks]
 
     @cached_property
     def arrows(self) -> dict[int, list[shapely.Polygon]]:
@@ -332,8 +316,32 @@ def sidewalk_width(corner: tuple[float, float], seed: int) -> float:
     return float(rng_at(seed, Purpose.SIDEWALK).uniform(1.6, 2.8))
 
 
-def lane_centre(lane: WorldLane, step_m: float) -> NDArrayFloat:
-    """(N, 2) the middle between the bounds of a lane, city metres, about step_m apart."""
+def crossing_direction(index: WorldIndex, crossing: shapely.Polygon) -> NDArrayFloat:
+    """(2,) unit vector along which vehicles drive over a crossing; its sign means nothing."""
+    total = np.zeros(2)
+    for lane in index.lanes_near(crossing):
+        centre = lane_centre(lane, 0.5)
+        steps = np.diff(centre, axis=0)
+        inside = shapely.intersects_xy(crossing, (centre[:-1] + centre[1:]) / 2)
+        # Opposite directions are one: doubled angles.
+        angle = 2 * np.arctan2(steps[inside, 1], steps[inside, 0])
+        total += [np.cos(angle).sum(), np.sin(angle).sum()]
+    if np.linalg.norm(total) < 0.5:  # no lane: the short side of the crossing
+        ring = shapely.get_coordinates(crossing.minimum_rotated_rectangle)[:3]
+        side = min(np.diff(ring, axis=0), key=lambda s: float(np.linalg.norm(s)))
+        return np.asarray(side / max(float(np.linalg.norm(side)), 1e-9))
+    angle = np.arctan2(total[1], total[0]) / 2
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def lane_centre(lane: WorldLane, step_m: float, share: float = 0.5) -> NDArrayFloat:
+    """(N, 2) a line along a lane, city metres, about step_m apart.
+
+    Args:
+        lane: The lane.
+        step_m: Between vertices.
+        share: Of the way from its left to its right bound; 0.5 is the middle.
+    """
     lengths = [arc_lengths(side)[-1] for side in (lane.left, lane.right)]
     n = max(int(max(lengths) / step_m), 1) + 1
     sides = []
@@ -341,7 +349,7 @@ def lane_centre(lane: WorldLane, step_m: float) -> NDArrayFloat:
         along = arc_lengths(side)
         at = np.linspace(0, along[-1], n)
         sides.append(np.column_stack([np.interp(at, along, side[:, d]) for d in (0, 1)]))
-    middle: NDArrayFloat = (sides[0] + sides[1]) / 2
+    middle: NDArrayFloat = sides[0] * (1.0 - share) + sides[1] * share
     return middle
 
 
