@@ -158,6 +158,7 @@ def test_image_and_sweep_agree_to_a_pixel(caster: RayCaster) -> None:
     rows = np.clip(v[:, None] + [-1, -1, -1, 0, 0, 0, 1, 1, 1], 0, camera.height_px - 1)
     cols = np.clip(u[:, None] + [-1, 0, 1, -1, 0, 1, -1, 0, 1], 0, camera.width_px - 1)
     agrees = (image.labels[rows, cols] == labels[:, None]).any(axis=1)
-    assert visible.sum() > 5000
-    assert agrees[visible].all()
+    assert visible.sum() > 20_000
+    # The tip of a sharp corner can lie between pixel centres; nothing else may.
+    assert (~agrees[visible]).sum() <= 2
     assert (image.labels[v, u] == labels)[visible].mean() > 0.97
