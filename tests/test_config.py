@@ -249,3 +249,20 @@ def test_numbers_are_read_as_ever(tmp_path: Path) -> None:
     options = load_config(written(tmp_path, f"vectorize: {{options: {{p: {text}}}}}"))
     expected = yaml.safe_load(text) | {"j": "1:30"}
     assert options.vectorize.options["p"] == expected
+
+
+@pytest.mark.parametrize(
+    ("written_as", "means"),
+    [("true", "gamma"), ("false", "off"), ("off", "off"), ("on", "gamma"), ("learned", "learned")],
+)
+def test_the_intensity_term_of_older_files_is_read(tmp_path, written_as, means):
+    path = written(tmp_path, f"observation:\n  intensity: {written_as}\n")
+    config = load_config(path)
+    assert config.observation.intensity == means
+    again = written(tmp_path, config.to_yaml())
+    assert load_config(again) == config
+
+
+def test_an_unknown_intensity_term_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"observation\.intensity.*learned"):
+        load_config(written(tmp_path, "observation:\n  intensity: sometimes\n"))

@@ -23,8 +23,8 @@ EVALUATED: Final = DRIVABLE_CLASSES
 """The classes of the paper's table: road, crosswalk, lane mark."""
 
 PAINT_SHARE: Final = 0.35
-"""A cell is lane mark when at least so much of it is paint: a mark 0.12 m wide fills 0.35 to
-0.6 of the 0.2 m cells along its middle, and a sliver of one does not make its neighbours marks."""
+"""A cell is lane mark when at least so much of it is paint. A mark 0.12 m wide covers 0.3 to 0.6
+of the fuller of the 0.2 m cells across it; a sliver of one does not make its neighbour a mark."""
 
 ANY_PAINT: Final = 0.0
 """The rule of the reference: any paint at all makes a cell mark, so its truth is dilated.

@@ -23,10 +23,10 @@ NUM_BINS: Final = 32
 _SMOOTHING_BINS: Final = 1.0
 """Standard deviation of the kernel that smooths a histogram, bins."""
 
-_NEUTRAL_CELLS: Final = 25.0
+NEUTRAL_CELLS: Final = 25.0
 """Cells' worth of the histogram of all classes that is added to each: a class that was hardly seen says nothing."""
 
-_UNRELATED: Final = 0.01
+UNRELATED: Final = 0.01
 """Share of cells whose intensity has nothing to do with their class: wet patches, leaves, wrong labels."""
 
 
@@ -85,6 +85,8 @@ class IntensityLikelihood:
         *,
         source: str = "",
         bin_edges: NDArrayFloat | None = None,
+        neutral_cells: float = NEUTRAL_CELLS,
+        unrelated: float = UNRELATED,
     ) -> IntensityLikelihood:
         """Learn it from cells whose classes are known, wholly or in part.
 
@@ -95,6 +97,8 @@ class IntensityLikelihood:
             classes: Their names.
             source: What this was learned from, kept with it.
             bin_edges: Other bins than `default_bin_edges`.
+            neutral_cells: Cells' worth of the histogram of all classes added to each.
+            unrelated: Share of cells whose intensity has nothing to do with their class.
 
         Raises:
             ShapeError: If the arrays do not fit, or no cell has an intensity and a class.
@@ -121,9 +125,9 @@ class IntensityLikelihood:
         smooth = gaussian_filter1d(histogram, _SMOOTHING_BINS, axis=1, mode="nearest")
         neutral = smooth.sum(axis=0) + 1.0
         neutral /= neutral.sum()
-        rows = smooth + _NEUTRAL_CELLS * neutral
+        rows = smooth + neutral_cells * neutral
         rows /= rows.sum(axis=1, keepdims=True)
-        rows = (1.0 - _UNRELATED) * rows + _UNRELATED * neutral
+        rows = (1.0 - unrelated) * rows + unrelated * neutral
         return cls(
             tuple(classes), edges, np.log(rows), np.log(neutral), histogram.sum(axis=1), source
         )
@@ -163,8 +167,8 @@ class IntensityLikelihood:
             source=self.source,
             bin_edges=tuple(self.bin_edges.tolist()),
             num_cells=tuple(round(n, 1) for n in self.num_cells.tolist()),
-            probability=tuple(tuple(row) for row in np.exp(self.log_probability).tolist()),
-            neutral=tuple(np.exp(self.log_neutral).tolist()),
+            probability=tuple(_shown(row) for row in self.log_probability),
+            neutral=_shown(self.log_neutral),
         )
         return document.model_dump_json(indent=1) + "\n"
 
@@ -245,6 +249,11 @@ class IntensityDocument(BaseModel):
     num_cells: tuple[Annotated[float, Field(ge=0)], ...]
     probability: tuple[tuple[_Positive, ...], ...]
     neutral: tuple[_Positive, ...]
+
+
+def _shown(log_probability: NDArrayFloat) -> tuple[float, ...]:
+    """Probabilities of 9 digits: more are noise, and reading and writing would change the last ones."""
+    return tuple(float(f"{p:.9g}") for p in np.exp(log_probability))
 
 
 def _bins_of(values: NDArrayFloat, edges: NDArrayFloat) -> NDArrayFloat:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from hdmap_tools.config import ObservationConfig
 from hdmap_tools.errors import ConfigError, LabelError
+from hdmap_tools.fusion.intensity_likelihood import IntensityLikelihood
 from hdmap_tools.fusion.observation_model import (
     OTHER,
     confusion_likelihood,
@@ -50,6 +51,38 @@ def test_counts_give_what_sequential_bayes_gives(seed, votes, kind, intensity):
         counts[label, intensity_bin, 0, 0] += 1
     expected = sequential_bayes(model.log_likelihood, model.log_prior, votes)
     np.testing.assert_allclose(model.posterior(counts)[:, 0, 0], expected, atol=1e-9, rtol=0)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    votes=st.lists(st.tuples(st.integers(0, 3), st.integers(0, 1)), min_size=1, max_size=30),
+    intensity=st.floats(0, 255),
+    weight=st.floats(0, 3),
+)
+@settings(max_examples=25, deadline=None)
+def test_the_mean_intensity_is_one_more_observation(seed, votes, intensity, weight):
+    rng = np.random.default_rng(seed)
+    learned = IntensityLikelihood.estimate(
+        rng.uniform(0, 255, 400), rng.dirichlet(np.ones(3), 400).T, ("road", "lane_mark", OTHER)
+    )
+    config = ObservationConfig(model="confusion")
+    plain = observation_model(config, meta(count_mode="point"), MAP_CLASSES, random_confusion(rng))
+    model = plain.with_intensity(learned, weight)
+    counts = np.zeros((len(ADAS), 2, 1, 1), dtype=np.uint32)
+    for label, intensity_bin in votes:
+        counts[label, intensity_bin, 0, 0] += 1
+    belief = sequential_bayes(model.log_likelihood, model.log_prior, votes)
+    # One more factor of Bayes' rule, by hand from the histogram.
+    column = np.searchsorted(learned.bin_edges, intensity, side="right") - 1
+    rows = learned.for_classes(model.classes).log_probability[:, column]
+    belief = belief * np.exp(weight * rows)
+    belief /= belief.sum()
+    got = model.posterior(counts, np.array([[intensity]]))[:, 0, 0]
+    np.testing.assert_allclose(got, belief, atol=1e-9, rtol=0)
+    # Without a return it says nothing.
+    np.testing.assert_allclose(
+        model.posterior(counts, np.array([[np.nan]])), plain.posterior(counts), atol=1e-12
+    )
 
 
 def test_share_votes_weigh_as_one_vote_a_frame():
