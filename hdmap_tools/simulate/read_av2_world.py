@@ -43,6 +43,7 @@ _STYLES: Final = {
 }
 _CITY: Final = re.compile(r"____([A-Z]+)_city_")
 _SAME_LINE_M: Final = 0.3
+_MIN_KERB_M: Final = 1.5
 _MAX_COORDINATE_M: Final = 1e7
 
 
@@ -220,16 +221,18 @@ def _kerbs(surface: Iterable[shapely.Polygon], lanes: Mapping[str, WorldLane]) -
         ends = [] if lane.successors else [-1]
         ends += [] if lane.id in entered else [0]
         for end in ends:
-            gate = shapely.LineString([lane.left[end], lane.right[end]])
+            # Not to its ends: a kerb beside a lane that ends within the map stays whole.
+            a, b = lane.left[end], lane.right[end]
+            gate = shapely.LineString([0.9 * a + 0.1 * b, 0.1 * a + 0.9 * b])
             gates.append(gate.buffer(1.5, cap_style="flat"))
-    opening = shapely.union_all(gates) if gates else shapely.Polygon()
+    opening = shapely.union_all(gates).buffer(0.6).buffer(-0.6)
     kerbs = []
     for number, polygon in enumerate(surface):
         for ring, outline in enumerate((polygon.exterior, *polygon.interiors)):
             parts = shapely.get_parts(shapely.line_merge(outline.difference(opening)))
             for part, line in enumerate(parts):
                 xy = drop_repeats(shapely.get_coordinates(line))
-                if len(xy) > 1:
+                if line.length > _MIN_KERB_M and len(xy) > 1:
                     identifier = f"drivable:{number}:{ring}:{part}"
                     kerbs.append(WorldLine(identifier, xy, LineKind.KERB_HIGH))
     return kerbs
