@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from hdmap_tools.compare.paper import PAINT_SHARE, true_classes
-from hdmap_tools.compare.reference import load_reference
+from hdmap_tools.compare.reference import SHARE_TOLERANCE, load_reference
 from hdmap_tools.compare.reliability import (
     CellTruth,
     ReliabilityReport,
@@ -102,8 +102,10 @@ def load_truth(
     from hdmap_tools.simulate.truth_raster import TruthRaster
 
     names = [str(c) for c in MAP_CLASSES]
-    shares = np.asarray(TruthRaster.open(path).class_fractions(grid, MAP_CLASSES))
-    if not np.isfinite(shares).all(axis=0).any():
+    raster = TruthRaster.open(path)
+    shares = raster.class_fractions(grid, MAP_CLASSES).astype(np.float64)
+    shares[:, raster.known_fraction(grid) < 1.0 - SHARE_TOLERANCE] = np.nan
+    if not np.isfinite(shares).any():
         raise FormatError(
             f"The truth raster {path} does not overlap the map; it belongs to another place."
         )
