@@ -8,13 +8,16 @@ over long distances it wanders.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdmap_tools.geometry.se3 import Trajectory
 from hdmap_tools.point_map.refine_config import RefineConfig
-from hdmap_tools.types import NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
+
+_MIN_CHANGES: Final = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +74,14 @@ class Prior:
         own: (S, 6) diagonal of each pose's block.
         next: (S, 6) diagonal of the block between each pose and the next of its drive;
             zero at a drive's end.
+        memory: (S, 6) share of a pose's error that the next one of its drive keeps.
+        sigma: (S, 6) of what the next one adds; both mean nothing at a drive's end.
     """
 
     own: NDArrayFloat
     next: NDArrayFloat
+    memory: NDArrayFloat
+    sigma: NDArrayFloat
 
     def times(self, vectors: NDArrayFloat) -> NDArrayFloat:
         """Precision times corrections (S, 6)."""
@@ -83,17 +90,19 @@ class Prior:
         result[1:] += self.next[:-1] * vectors[:-1]
         return result
 
-    def cost(self, vectors: NDArrayFloat) -> float:
-        """Half the squared Mahalanobis length of corrections (S, 6)."""
-        return float((vectors * self.times(vectors)).sum() / 2)
-
 
 def sigmas(config: RefineConfig) -> NDArrayFloat:
     """(6,) of one given pose, about its drift: metres, then radians."""
     return np.repeat([config.noise_m, np.deg2rad(config.noise_deg)], 3)
 
 
-def drive_prior(trajectory: Trajectory, config: RefineConfig, *, is_reference: bool) -> Prior:
+def drive_prior(
+    trajectory: Trajectory,
+    config: RefineConfig,
+    *,
+    is_reference: bool,
+    scale: tuple[float, float] = (1.0, 1.0),
+) -> Prior:
     """What is assumed of the errors of one drive's poses.
 
     Noise that forgets itself and drift that walks are joined into one Gauss-Markov
@@ -103,69 +112,110 @@ def drive_prior(trajectory: Trajectory, config: RefineConfig, *, is_reference: b
         trajectory: Given poses at the sweeps' times.
         config: Gives the sigmas.
         is_reference: Its place as a whole is believed; other drives are aligned to it.
+        scale: Of noise and drift, in metres and in degrees, against those in `config`.
     """
+    scales = np.repeat(scale, 3)
     seconds = np.diff(trajectory.timestamps_ns) / 1e9
     metres = np.linalg.norm(np.diff(trajectory.translations, axis=0), axis=1)
-    noise = sigmas(config)
-    drift = np.repeat([config.drift_m, np.deg2rad(config.drift_deg)], 3)
+    noise = sigmas(config) * scales
+    drift = np.repeat([config.drift_m, np.deg2rad(config.drift_deg)], 3) * scales
     forgotten = -np.expm1(-seconds / config.noise_correlation_s)
     change = 2 * noise**2 * forgotten[:, None] + drift**2 * metres[:, None] / 100.0
     spread = noise**2 + drift**2 * max(trajectory.length_m, 100.0) / 100.0
     if not is_reference:
         between = (config.between_drives_m, np.deg2rad(config.between_drives_deg))
         spread = spread + np.repeat(between, 3) ** 2
-    memory = np.clip(1 - change / (2 * spread), 0.0, 1 - 1e-9)
-    innovation = 1 / (spread * (1 - memory**2))
-    own = np.zeros((len(trajectory), 6))
+    memory = np.zeros((len(trajectory), 6))
+    memory[:-1] = np.clip(1 - change / (2 * spread), 0.0, 1 - 1e-9)
+    innovation = 1 / (spread * (1 - memory[:-1] ** 2))
+    own = np.zeros_like(memory)
     own[0] = 1 / spread
     own[1:] += innovation
-    own[:-1] += memory**2 * innovation
-    after = np.zeros((len(trajectory), 6))
-    after[:-1] = -memory * innovation
-    return Prior(own, after)
+    own[:-1] += memory[:-1] ** 2 * innovation
+    after = np.zeros_like(memory)
+    after[:-1] = -memory[:-1] * innovation
+    return Prior(own, after, memory, np.sqrt(spread * (1 - memory**2)))
+
+
+def observed_scale(
+    prior: Prior, correction: Correction, is_held: NDArrayBool
+) -> tuple[float, float]:
+    """How large the corrections of one drive change from pose to pose, against the prior.
+
+    Poses better than assumed would else be made worse: registration has errors, too.
+
+    Args:
+        prior: Of that drive.
+        correction: Found with it.
+        is_held: (S, 6) which of each pose's directions the scene holds; the others
+            were not corrected and say nothing.
+
+    Returns:
+        Factor of metres and of degrees; 1 where too little is held to say.
+    """
+    vectors = correction.vectors
+    whitened = (vectors[1:] - prior.memory[:-1] * vectors[:-1]) / prior.sigma[:-1]
+    usable = is_held[1:] & is_held[:-1]
+    factors = []
+    for part in (slice(0, 3), slice(3, 6)):
+        values = np.abs(whitened[:, part][usable[:, part]])
+        # The median, so that a few wild registrations do not count.
+        is_enough = len(values) >= 3 * _MIN_CHANGES
+        factors.append(float(np.median(values)) / 0.6745 if is_enough else 1.0)
+    return factors[0], factors[1]
 
 
 def joined_priors(priors: list[Prior]) -> Prior:
     """Of several drives, one after another."""
-    return Prior(np.concatenate([p.own for p in priors]), np.concatenate([p.next for p in priors]))
+    return Prior(
+        np.concatenate([prior.own for prior in priors]),
+        np.concatenate([prior.next for prior in priors]),
+        np.concatenate([prior.memory for prior in priors]),
+        np.concatenate([prior.sigma for prior in priors]),
+    )
 
 
 def solve(
     prior: Prior,
+    current: Correction,
     rows: NDArrayInt,
     columns: NDArrayInt,
     blocks: NDArrayFloat,
     gradient: NDArrayFloat,
+    ties: NDArrayFloat | None = None,
 ) -> NDArrayFloat:
-    """The step (S, 6) that the normal equations ask for.
+    """The step (S, 6) from the current corrections that prior and registration ask for.
+
+    With `ties`, each pose has a double that registration acts on, and the two are
+    bound together in the directions that the scene holds. In the others the double is
+    free, so that registration says nothing there. Projecting those directions out of
+    each pose's equations instead would not do: what a neighbour knows would then push
+    the drive as a whole (34 cm in a trial), because a common shift no longer cancels.
 
     Args:
-        prior: Adds its precision.
+        prior: What the given poses say.
+        current: Where the equations were made.
         rows: (B,) of the blocks, not above `columns`.
         columns: (B,).
         blocks: (B, 6, 6) upper half of the registration's information.
-        gradient: (S, 6) of registration and prior together.
+        gradient: (S, 6) of registration.
+        ties: (S, 6, 6) information of the bond, or None where all is held.
     """
-    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse import block_array, diags
     from scipy.sparse.linalg import splu
 
-    size = gradient.size
-    inside = np.arange(6)
-    at_row = np.broadcast_to(6 * rows[:, None, None] + inside[:, None], blocks.shape)
-    at_column = np.broadcast_to(6 * columns[:, None, None] + inside, blocks.shape)
-    is_off = rows != columns
-    matrix = coo_matrix(
-        (
-            np.concatenate([blocks.ravel(), blocks[is_off].ravel()]),
-            (
-                np.concatenate([at_row.ravel(), at_column[is_off].ravel()]),
-                np.concatenate([at_column.ravel(), at_row[is_off].ravel()]),
-            ),
-        ),
-        shape=(size, size),
-    ).tocsc()
+    count = len(gradient)
+    registered = _symmetric(rows, columns, blocks, count)
     beside = prior.next.ravel()[:-6]
-    matrix = matrix + diags([prior.own.ravel(), beside, beside], [0, 6, -6], format="csc")
+    given = diags([prior.own.ravel(), beside, beside], [0, 6, -6], format="csc")
+    pull = prior.times(current.vectors).ravel()
+    if ties is None:
+        matrix, right = given + registered, pull + gradient.ravel()
+    else:
+        numbers = np.arange(count)
+        tie = _symmetric(numbers, numbers, ties, count)
+        matrix = block_array([[given + tie, -tie], [-tie, registered + tie]], format="csc")
+        right = np.concatenate([pull, gradient.ravel()])
     # Metres and radians in one scale, so that pivots on the diagonal are sound.
     scale = 1 / np.sqrt(matrix.diagonal())
     scaling = diags([scale], [0], format="csc")
@@ -175,5 +225,21 @@ def solve(
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    step: NDArrayFloat = -(scale * factor.solve(scale * gradient.ravel())).reshape(-1, 6)
-    return step
+    step: NDArrayFloat = -(scale * factor.solve(scale * right))
+    return step[: 6 * count].reshape(-1, 6)
+
+
+def _symmetric(rows: NDArrayInt, columns: NDArrayInt, blocks: NDArrayFloat, count: int) -> Any:
+    """A sparse (6 S, 6 S) matrix from blocks (B, 6, 6) of its upper half."""
+    from scipy.sparse import coo_matrix
+
+    inside = np.arange(6)
+    at_row = np.broadcast_to(6 * rows[:, None, None] + inside[:, None], blocks.shape)
+    at_column = np.broadcast_to(6 * columns[:, None, None] + inside, blocks.shape)
+    is_off = rows != columns
+    values = np.concatenate([blocks.ravel(), blocks[is_off].ravel()])
+    at = (
+        np.concatenate([at_row.ravel(), at_column[is_off].ravel()]),
+        np.concatenate([at_column.ravel(), at_row[is_off].ravel()]),
+    )
+    return coo_matrix((values, at), shape=(6 * count, 6 * count)).tocsc()

@@ -31,7 +31,9 @@ class RefineConfig(BaseModel):
             surface are off together: no surface is plane, no points are independent.
         passes: How often the map is made anew from the poses found.
         min_information: A direction counts as held when registration knows it so many
-            times better (in variance) than `noise_m` and `noise_deg`.
+            times better (in variance) than `noise_m` and `noise_deg`. Measured in ray-cast
+            scenes: up to 1.5 where a scene holds nothing, 17 and more (16 rings, 360
+            azimuths) or 50 and more (32 rings) in a street.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -52,7 +54,7 @@ class RefineConfig(BaseModel):
     range_noise_m: Positive = 0.02
     surface_noise_m: Positive = 0.008
     passes: Annotated[int, Field(ge=1, le=20)] = 5
-    min_information: Positive = 30.0
+    min_information: Positive = 10.0
 
 
 class RefineReport(BaseModel):
@@ -63,9 +65,13 @@ class RefineReport(BaseModel):
         num_registered: Those that found enough surfaces in the map.
         num_keyframes: Those that made the map.
         correction_m, correction_deg: RMS of what was changed.
+        found_noise_m, found_noise_deg: Noise of the given poses as registration saw it,
+            where the scene holds them; what was assumed where it does not.
+        is_smooth_position, is_smooth_attitude: Between sweeps a smooth motion was taken,
+            and not the given poses with their correction.
         held: Share of the sweeps that the scene holds, by direction: ``along`` and
             ``across`` the vehicle, ``up``, ``roll``, ``pitch``, ``yaw``.
-        reason: Why the poses were left alone, or None.
+        reason: Why the poses, or which directions of them, were left alone, or None.
         seconds: Time spent.
     """
 
@@ -76,6 +82,10 @@ class RefineReport(BaseModel):
     num_keyframes: int = 0
     correction_m: float = 0.0
     correction_deg: float = 0.0
+    found_noise_m: float | None = None
+    found_noise_deg: float | None = None
+    is_smooth_position: bool = False
+    is_smooth_attitude: bool = False
     held: dict[str, float] = Field(default_factory=dict)
     reason: str | None = None
     seconds: float = 0.0

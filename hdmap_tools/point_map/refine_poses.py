@@ -17,23 +17,27 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
 from hdmap_tools.errors import CRSMismatchError, PointMapError
 from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.point_map.between_sweeps import refined_between
 from hdmap_tools.point_map.pose_graph import (
     Correction,
     Prior,
     drive_prior,
     joined_priors,
+    observed_scale,
     sigmas,
     solve,
 )
 from hdmap_tools.point_map.refine_config import RefineConfig, RefineReport
 from hdmap_tools.point_map.registration import (
     DIRECTIONS,
+    Hold,
     Observations,
     SurfaceMap,
     SweepPoints,
@@ -47,6 +51,7 @@ from hdmap_tools.point_map.registration import (
 from hdmap_tools.readers.drive import Drive, SweepRef
 from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
 
+Scale = tuple[float, float]
 _log = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
@@ -57,6 +62,10 @@ _VISIT_M: Final = 50.0
 """Sweeps within so many metres of driving are one visit: their poses agree but for noise."""
 
 _MIN_SURFACES: Final = 30
+_MOSTLY: Final = 0.9
+_SCALES: Final = (0.05, 5.0)
+"""Between these, the errors assumed of given poses are adapted to those found."""
+
 _MAX_POSE_GAP_S: Final = 0.5
 
 
@@ -79,13 +88,37 @@ class RefinedPoses:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Chosen sweeps of all drives, one drive after another."""
+    """Keyframes of all drives, one drive after another.
+
+    Attributes:
+        refs: The keyframes.
+        given: Their given poses, by drive.
+        parts: Where each drive's keyframes lie among all.
+        visits: (K,) number of the visit each belongs to.
+    """
 
     refs: list[tuple[Drive, SweepRef]]
-    rotations: NDArrayFloat
-    translations: NDArrayFloat
+    given: list[Trajectory | None]
+    parts: list[slice]
     visits: NDArrayInt
-    prior: Prior
+
+    @cached_property
+    def rotations(self) -> NDArrayFloat:
+        """(K, 3, 3) as given."""
+        return np.concatenate([given.rotations for given in self.given if given])
+
+    @cached_property
+    def translations(self) -> NDArrayFloat:
+        """(K, 3) as given."""
+        return np.concatenate([given.translations for given in self.given if given])
+
+    def priors(self, scales: list[Scale], config: RefineConfig) -> list[Prior]:
+        """Of each drive."""
+        return [
+            drive_prior(given, config, is_reference=index == 0, scale=scale)
+            for index, (given, scale) in enumerate(zip(self.given, scales, strict=True))
+            if given
+        ]
 
 
 def refine_poses(
@@ -122,24 +155,34 @@ def refine_poses(
             progress(done, total)
         return points, weights
 
-    place = _place(drives, chosen, config)
+    place = _place(drives, chosen)
+    if not place.refs:
+        return [
+            _left_alone(drive, RefineReport(num_sweeps=0, reason="no sweep has a pose"))
+            for drive in drives
+        ]
     thinned = [read(drive, ref) for drive, ref in place.refs]
-    correction, surfaces = _refine_keyframes(place, SweepPoints.joined(thinned), config)
+    correction, surfaces, scales = _refine_keyframes(place, SweepPoints.joined(thinned), config)
     del thinned
     results = []
-    first = 0
     for index, (drive, refs, keys) in enumerate(zip(drives, used, chosen, strict=True)):
-        part = slice(first, first + len(keys))
-        first += len(keys)
-        own = Correction(correction.shifts[part], correction.turns[part])
+        part = place.parts[index]
         results.append(
             _refine_sweeps(
-                drive, refs, keys, own, surfaces, config, read=read, is_reference=index == 0
+                *(drive, refs, keys),
+                Correction(correction.shifts[part], correction.turns[part]),
+                *(scales[index], surfaces, config),
+                read=read,
+                is_reference=index == 0,
             )
         )
     seconds = time.perf_counter() - start
     _log.info("Refined the poses of %d sweeps in %.1f s.", sum(map(len, used)), seconds)
     return results
+
+
+def _left_alone(drive: Drive, report: RefineReport) -> RefinedPoses:
+    return RefinedPoses(drive.id, drive.trajectory, False, report)
 
 
 def _check(drives: Sequence[Drive]) -> None:
@@ -195,57 +238,78 @@ def _driven(trajectory: Trajectory) -> NDArrayFloat:
     return result
 
 
-def _place(drives: Sequence[Drive], chosen: list[list[SweepRef]], config: RefineConfig) -> _Place:
+def _place(drives: Sequence[Drive], chosen: list[list[SweepRef]]) -> _Place:
     refs: list[tuple[Drive, SweepRef]] = []
-    rotations, translations, visits, priors = [], [], [], []
+    place = _Place(refs, [], [], np.zeros(0, np.int64))
+    visits = [np.zeros(0, np.int64)]
     next_visit = 0
-    for index, (drive, keys) in enumerate(zip(drives, chosen, strict=True)):
-        if not keys:
-            continue
-        given = _given(drive, keys)
+    for drive, keys in zip(drives, chosen, strict=True):
+        place.parts.append(slice(len(refs), len(refs) + len(keys)))
+        place.given.append(_given(drive, keys) if keys else None)
         refs += [(drive, ref) for ref in keys]
-        rotations.append(given.rotations)
-        translations.append(given.translations)
-        visits.append(next_visit + (_driven(given) / _VISIT_M).astype(np.int64))
-        next_visit = int(visits[-1][-1]) + 1
-        priors.append(drive_prior(given, config, is_reference=index == 0))
-    if not refs:
-        return _Place(
-            [],
-            np.zeros((0, 3, 3)),
-            np.zeros((0, 3)),
-            np.zeros(0, np.int64),
-            Prior(np.zeros((0, 6)), np.zeros((0, 6))),
-        )
-    return _Place(
-        refs,
-        np.concatenate(rotations),
-        np.concatenate(translations),
-        np.concatenate(visits),
-        joined_priors(priors),
-    )
+        if keys:
+            visits.append(next_visit + (_driven(_given(drive, keys)) / _VISIT_M).astype(np.int64))
+            next_visit = int(visits[-1][-1]) + 1
+    return replace(place, visits=np.concatenate(visits))
 
 
 def _refine_keyframes(
     place: _Place, points: SweepPoints, config: RefineConfig
-) -> tuple[Correction, SurfaceMap]:
-    """Solve for all keyframes at once, as often as `passes` says; the map of the last poses."""
+) -> tuple[Correction, SurfaceMap, list[Scale]]:
+    """Solve for all keyframes at once, as often as `passes` says.
+
+    Returns:
+        Corrections of all keyframes, the map of the poses so corrected, and for each
+        drive how large its errors are against what was assumed.
+    """
     correction = Correction.none(len(place.refs))
+    scales: list[Scale] = [(1.0, 1.0)] * len(place.given)
     for index in range(config.passes):
         surfaces, seen, poses = _cut(place, points, correction, index, config)
         if len(surfaces) < _MIN_SURFACES:
             break
-        step = _joint_step(place, correction, poses, surfaces, seen, _robust_m(index), config)
+        step, hold = _joint_step(
+            place, scales, correction, poses, surfaces, seen, _robust_m(index), config
+        )
         correction = correction.plus(step)
+        scales = _observed_scales(place, scales, correction, hold, config)
         _log.debug(
-            "Pass %d: %d surfaces, %d observations, RMS step %.4f m.",
+            "Pass %d: %d surfaces, %d observations, RMS step %.4f m, errors %s of those assumed.",
             index,
             len(surfaces),
             len(seen.sweep),
             float(np.sqrt((step[:, :3] ** 2).sum(axis=1).mean())),
+            scales,
         )
     surfaces, seen, _ = _cut(place, points, correction, config.passes, config)
-    return correction, _without_outliers(surfaces, seen, config)
+    return correction, _without_outliers(surfaces, seen, config), scales
+
+
+def _observed_scales(
+    place: _Place,
+    scales: list[Scale],
+    correction: Correction,
+    hold: Hold,
+    config: RefineConfig,
+) -> list[Scale]:
+    is_held = np.einsum("skk->sk", hold.keep) > 0.9
+    priors = iter(place.priors(scales, config))
+    result = []
+    for given, part, scale in zip(place.given, place.parts, scales, strict=True):
+        if given is None:
+            result.append(scale)
+            continue
+        factors = observed_scale(
+            next(priors),
+            Correction(correction.shifts[part], correction.turns[part]),
+            is_held[part],
+        )
+        metres, degrees = (
+            float(np.clip(old * factor, *_SCALES))
+            for old, factor in zip(scale, factors, strict=True)
+        )
+        result.append((metres, degrees))
+    return result
 
 
 def _without_outliers(surfaces: SurfaceMap, seen: Observations, config: RefineConfig) -> SurfaceMap:
@@ -294,13 +358,14 @@ def _cut(
 
 def _joint_step(
     place: _Place,
+    scales: list[Scale],
     correction: Correction,
     positions: NDArrayFloat,
     surfaces: SurfaceMap,
     seen: Observations,
     robust_m: float,
     config: RefineConfig,
-) -> NDArrayFloat:
+) -> tuple[NDArrayFloat, Hold]:
     from hdmap_tools.point_map.surfel_kernels import assemble, informations, mark_pairs
 
     count = len(place.refs)
@@ -311,9 +376,14 @@ def _joint_step(
         *(seen.starts, seen.sweep, seen.surface, arms, weights),
         *(surfaces.normals, surfaces.tilts, count, False),
     )
-    keep = held_directions(information, sigmas(config), config.min_information)
-    # A change c moves a point by J c; with J keep, only what is held counts.
-    rows = np.einsum("ok,okm->om", jacobians(normals, arms), keep[seen.sweep])
+    given_sigmas = np.concatenate(
+        [
+            np.tile(sigmas(config) * np.repeat(scale, 3), (part.stop - part.start, 1))
+            for scale, part in zip(scales, place.parts, strict=True)
+        ]
+    )
+    hold = held_directions(information, given_sigmas, config.min_information)
+    rows = jacobians(normals, arms)
     pairs = mark_pairs(seen.starts, seen.sweep, count)
     at_row, at_column = np.nonzero(pairs >= 0)
     numbers = pairs[at_row, at_column]
@@ -321,8 +391,9 @@ def _joint_step(
         *(seen.starts, seen.sweep, rows, weights, off - offsets[seen.surface]),
         *(pairs, len(numbers)),
     )
-    gradient += place.prior.times(correction.vectors)
-    return solve(place.prior, at_row, at_column, blocks[numbers], gradient)
+    prior = joined_priors(place.priors(scales, config))
+    ties = None if hold.is_full else hold.ties
+    return solve(prior, correction, at_row, at_column, blocks[numbers], gradient, ties), hold
 
 
 def _refine_sweeps(
@@ -330,6 +401,7 @@ def _refine_sweeps(
     refs: list[SweepRef],
     keys: list[SweepRef],
     correction: Correction,
+    scale: Scale,
     surfaces: SurfaceMap,
     config: RefineConfig,
     *,
@@ -346,9 +418,10 @@ def _refine_sweeps(
             f"expected at least {_MIN_SURFACES}"
         )
         report = RefineReport(num_sweeps=len(refs), num_keyframes=len(keys), reason=reason)
-        return RefinedPoses(drive.id, drive.trajectory, False, report)
+        return _left_alone(drive, report)
     given = _given(drive, refs)
-    prior = drive_prior(given, config, is_reference=is_reference)
+    prior = drive_prior(given, config, is_reference=is_reference, scale=scale)
+    given_sigmas = sigmas(config) * np.repeat(scale, 3)
     current = correction.at(_times(keys), _times(refs))
     information = np.zeros((len(refs), 6, 6))
     gradient = np.zeros((len(refs), 6))
@@ -357,13 +430,15 @@ def _refine_sweeps(
     rotations, translations = current.applied(given.rotations, given.translations)
     for index, ref in enumerate(refs):
         points, weights = read(drive, ref)
-        found = _register(points, weights, rotations[index], translations[index], surfaces, config)
+        found = _register(
+            *(points, weights, rotations[index], translations[index]),
+            *(surfaces, given_sigmas, config),
+        )
         if found is not None:
             information[index], gradient[index], keep[index] = found
             is_registered[index] = True
-    gradient += prior.times(current.vectors)
     numbers = np.arange(len(refs))
-    refined = current.plus(solve(prior, numbers, numbers, information, gradient))
+    refined = current.plus(solve(prior, current, numbers, numbers, information, gradient))
     seconds = time.perf_counter() - start
     held = _held_share(keep, given.rotations)
     report = RefineReport(
@@ -374,20 +449,31 @@ def _refine_sweeps(
         seconds=seconds,
     )
     if max(held.values()) == 0.0:
-        report = report.model_copy(update={"reason": "the scene holds no direction of any sweep"})
-        return RefinedPoses(drive.id, drive.trajectory, False, report)
-    everywhere = refined.at(given.timestamps_ns, drive.trajectory.timestamps_ns)
-    trajectory = Trajectory(
-        drive.trajectory.timestamps_ns,
-        *everywhere.applied(drive.trajectory.rotations, drive.trajectory.translations),
+        return _left_alone(drive, report.model_copy(update={"reason": _why_nothing(scale)}))
+    trajectory, bridging = refined_between(
+        *(drive.trajectory, given, refined),
+        may_smooth_position=all(held[name] > _MOSTLY for name in DIRECTIONS[:3]),
+        may_smooth_attitude=all(held[name] > _MOSTLY for name in DIRECTIONS[3:]),
     )
+    loose = [name for name in DIRECTIONS if held[name] < 1 - _MOSTLY]
     report = report.model_copy(
         update={
             "correction_m": float(np.sqrt((refined.shifts**2).sum(axis=1).mean())),
             "correction_deg": float(np.rad2deg(np.sqrt((refined.turns**2).sum(axis=1).mean()))),
+            "reason": f"the scene does not hold {', '.join(loose)}: as given" if loose else None,
+            "found_noise_m": config.noise_m * scale[0],
+            "found_noise_deg": config.noise_deg * scale[1],
+            "is_smooth_position": bridging.is_smooth_position,
+            "is_smooth_attitude": bridging.is_smooth_attitude,
         }
     )
     return RefinedPoses(drive.id, trajectory, True, report)
+
+
+def _why_nothing(scale: Scale) -> str:
+    if scale[0] < 0.5:
+        return "the given poses agree with the scene as well as registration can tell"
+    return "the scene holds no direction of any sweep"
 
 
 def _register(
@@ -396,6 +482,7 @@ def _register(
     rotation: NDArrayFloat,
     translation: NDArrayFloat,
     surfaces: SurfaceMap,
+    given_sigmas: NDArrayFloat,
     config: RefineConfig,
 ) -> tuple[NDArrayFloat, NDArrayFloat, NDArrayFloat] | None:
     """Information (6, 6), gradient (6,) at the pose, and what is held (6, 6); None without surfaces."""
@@ -416,7 +503,7 @@ def _register(
             *(np.zeros(1, np.int64), seen.sweep, seen.surface, arms, weighing),
             *(surfaces.normals, surfaces.tilts, 1, True),
         )
-        keep = held_directions(known, sigmas(config), config.min_information)[0]
+        keep = held_directions(known, given_sigmas[None], config.min_information).keep[0]
         rows = jacobians(normals, arms) @ keep
         information = (rows * weighing[:, None]).T @ rows
         gradient = rows.T @ (weighing * off)

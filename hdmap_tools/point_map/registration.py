@@ -24,6 +24,10 @@ _MIN_SPREAD: Final = 0.12
 """Of a surface's points, in its size, across its narrower side: less is a line, whose
 plane may turn about it (points spread evenly over a square have 0.29)."""
 
+_TIGHT: Final = 1e7
+_LOOSE: Final = 1e-4
+"""Of a bond, in units of the given poses' information: a hundredth of a millimetre, and metres."""
+
 _BITS: Final = 21
 _OFFSET: Final = 1 << 20
 
@@ -264,23 +268,44 @@ def jacobians(normals: NDArrayFloat, arms: NDArrayFloat) -> NDArrayFloat:
     return np.concatenate([normals, np.cross(arms, normals)], axis=1)
 
 
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """Which directions of each pose the scene holds.
+
+    Attributes:
+        keep: (S, 6, 6) takes a change of pose to the part of it that is held.
+        ties: (S, 6, 6) information of a bond that is tight in what is held, loose else.
+        is_full: All directions of all poses are held.
+    """
+
+    keep: NDArrayFloat
+    ties: NDArrayFloat
+    is_full: bool
+
+
 def held_directions(
     information: NDArrayFloat, sigmas: NDArrayFloat, min_information: float
-) -> NDArrayFloat:
-    """Matrices (S, 6, 6) that keep of each pose's change only what the scene holds.
+) -> Hold:
+    """Find them by the eigenvalues of each pose's information.
 
     Args:
         information: (S, 6, 6) of each pose, from registration.
-        sigmas: (6,) of the given poses, which make metres and radians comparable.
+        sigmas: (S, 6) of the given poses, which make metres and radians comparable.
         min_information: A direction is held when its information, times the variance
             of the given poses in it, is at least this.
     """
-    scaled = information * sigmas[:, None] * sigmas
+    outer = sigmas[:, :, None] * sigmas[:, None, :]
+    scaled = information * outer
     values, vectors = np.linalg.eigh((scaled + scaled.transpose(0, 2, 1)) / 2)
-    kept = vectors * (values >= min_information)[:, None, :]
-    projection = kept @ vectors.transpose(0, 2, 1)
-    result: NDArrayFloat = projection * sigmas[:, None] / sigmas
-    return result
+    is_held = values >= min_information
+
+    def with_values(diagonal: NDArrayFloat) -> NDArrayFloat:
+        result: NDArrayFloat = (vectors * diagonal[:, None, :]) @ vectors.transpose(0, 2, 1)
+        return result
+
+    keep = with_values(is_held.astype(np.float64)) * sigmas[:, :, None] / sigmas[:, None, :]
+    ties = with_values(np.where(is_held, _TIGHT, _LOOSE)) / outer
+    return Hold(keep, ties, bool(is_held.all()))
 
 
 def _pack(cells: NDArrayInt) -> NDArrayInt:

@@ -182,3 +182,15 @@ def aligned_errors(poses: Trajectory, truth: Trajectory) -> tuple[float, float]:
         float(np.sqrt((off**2).sum(1).mean())),
         float(np.rad2deg(np.sqrt((turned.magnitude() ** 2).mean()))),
     )
+
+
+def mutual_error_m(
+    first: Trajectory, second: Trajectory, true_first: Trajectory, true_second: Trajectory
+) -> float:
+    """RMS of how differently two drives are off where they come nearest to each other."""
+    apart = np.linalg.norm(
+        true_first.translations[:, None] - true_second.translations[None], axis=2
+    )
+    off = first.translations - true_first.translations
+    other = (second.translations - true_second.translations)[apart.argmin(axis=1)]
+    return float(np.sqrt(((off - other) ** 2).sum(axis=1).mean()))
