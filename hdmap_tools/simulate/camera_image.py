@@ -19,9 +19,12 @@ from hdmap_tools.simulate.light import CameraLook, Light, light_of
 from hdmap_tools.simulate.materials import MATERIALS, Mat
 from hdmap_tools.simulate.ray_caster import Hits, RayCaster
 from hdmap_tools.simulate.scene import label_ids_by_material
-from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat32
+from hdmap_tools.types import NDArrayByte, NDArrayFloat32
 
 LABEL_SET: Final = "paz2020"
+
+_SKY_REACH: Final = 2.5
+"""Lengths of rays to the sky, which are 0 to 2 m each: what is further away hides little of it."""
 
 _textures: WeakKeyDictionary[RayCaster, GroundTexture] = WeakKeyDictionary()
 
@@ -118,8 +121,8 @@ def _shaded(
     if texture is None:
         texture = _textures[caster] = ground_texture(caster.scene.surface)
     answers, amplitudes = _answers()
-    in_sun = _in_sun(caster, rays, hits, light, time_s)
-    open_sky = np.ones(len(rays), np.float32)
+    sunlight = _sunlight(caster, camera, rays, hits, light, time_s)
+    open_sky = _open_sky(caster, camera, rays, hits, light, time_s)
     surface = caster.scene.surface
     image = np.empty((len(rays), 3), np.float32)
 
@@ -132,7 +135,7 @@ def _shaded(
             hits.material,
             hits.normal,
             hits.on_ground,
-            in_sun,
+            sunlight,
             open_sky,
             caster.scene.origin_city,
             camera.fx,
@@ -153,17 +156,26 @@ def _shaded(
     return image
 
 
-def _in_sun(
-    caster: RayCaster, rays: NDArrayFloat32, hits: Hits, light: Light, time_s: float
-) -> NDArrayBool:
-    """Which hits the sun shines on; all where it casts no shadows worth a ray."""
+def _sunlight(
+    caster: RayCaster,
+    camera: PinholeCamera,
+    rays: NDArrayFloat32,
+    hits: Hits,
+    light: Light,
+    time_s: float,
+) -> NDArrayFloat32:
+    """(N,) how much of the sun each hit gets; all of it where shadows are not worth a ray."""
     from hdmap_tools.simulate.compiled import in_bands
-    from hdmap_tools.simulate.shading import sun_rays
+    from hdmap_tools.simulate.shading import spread_sunlight, sun_rays
 
+    sunlight = np.ones(len(rays), np.float32)
     if max(light.sun) < 0.2:
-        return np.ones(len(rays), np.bool_)
-    faces_sun = hits.normal @ np.array(light.sun_direction, np.float32) > 0
-    rows = np.flatnonzero(faces_sun & (hits.material != Mat.SKY))
+        return sunlight
+    shape = (camera.height_px, camera.width_px)
+    asked = np.zeros(shape, np.bool_)
+    asked[::2, ::2] = asked[1::2, 1::2] = True
+    asked = asked.ravel() & (hits.normal @ np.array(light.sun_direction, np.float32) > 0)
+    rows = np.flatnonzero(asked & (hits.material != Mat.SKY))
     towards_sun = np.empty((len(rows), 6), np.float32)
     in_bands(
         lambda first, last: sun_rays(
@@ -171,9 +183,57 @@ def _in_sun(
         ),
         len(rows),
     )
-    in_sun = np.zeros(len(rays), np.bool_)
-    in_sun[rows] = ~caster.is_blocked(towards_sun, time_s)
-    return in_sun
+    traced = np.full(len(rays), 2, np.uint8)
+    traced[rows] = ~caster.is_blocked(towards_sun, time_s)
+    arrays = (
+        traced.reshape(shape),
+        hits.on_ground.reshape(shape),
+        hits.t.reshape(shape),
+        hits.normal.reshape(*shape, 3),
+        sunlight.reshape(shape),
+    )
+    in_bands(lambda first, last: spread_sunlight(first, last, *arrays), shape[0])
+    return sunlight
+
+
+def _open_sky(
+    caster: RayCaster,
+    camera: PinholeCamera,
+    rays: NDArrayFloat32,
+    hits: Hits,
+    light: Light,
+    time_s: float,
+) -> NDArrayFloat32:
+    """(N,) part of the sky that reaches each hit; all of it where the sun casts shadows.
+
+    Without a sun, the dark under a vehicle is all that sets it on the road. A ray for one
+    pixel in eight, as far as a few metres, the mean over their neighbourhood.
+    """
+    import cv2
+
+    from hdmap_tools.simulate.compiled import in_bands
+    from hdmap_tools.simulate.shading import sky_rays
+
+    if max(light.sun) >= 0.2:
+        return np.ones(len(rays), np.float32)
+    shape = (camera.height_px, camera.width_px)
+    asked = np.zeros(shape, np.float32)
+    asked[::4, ::2] = asked[2::4, 1::2] = 1.0
+    asked[hits.material.reshape(shape) == Mat.SKY] = 0.0
+    rows = np.flatnonzero(asked)
+    towards_sky = np.empty((len(rows), 6), np.float32)
+    in_bands(
+        lambda first, last: sky_rays(
+            first, last, rows, rays, hits.t, hits.normal, light.noise_seed, towards_sky
+        ),
+        len(rows),
+    )
+    is_open = np.zeros(len(rays), np.float32)
+    is_open[rows] = ~caster.is_blocked(towards_sky, time_s, reach_m=_SKY_REACH)
+    sums = cv2.blur(is_open.reshape(shape), (13, 13))
+    counts = cv2.blur(asked, (13, 13))
+    share = np.where(counts > 1e-3, sums / np.maximum(counts, 1e-3), 1.0)
+    return np.asarray(0.25 + 0.75 * share, dtype=np.float32).ravel()
 
 
 @lru_cache(maxsize=1)

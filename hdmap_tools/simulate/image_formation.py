@@ -39,6 +39,15 @@ _OPTICS = {
     Difficulty.DEFAULT: Optics(0.70, 0.018, 0.004, 0.25, 0, 0.06, 0.015),
     Difficulty.HARD: Optics(0.95, 0.035, 0.009, 0.35, 12, 0.15, 0.03),
 }
+_WHITE_BALANCE = {
+    Weather.CLEAR: (0.97, 1.0, 1.06),
+    Weather.OVERCAST: (1.0, 1.0, 1.0),
+    Weather.HAZE: (0.97, 1.0, 1.04),
+    Weather.WET: (1.0, 1.0, 1.0),
+    Weather.DUSK: (0.92, 1.0, 1.06),
+}
+"""Gains of red, green, blue: cameras take out most of the light's colour, not all of it."""
+
 _MEAN_LIGHT = 0.15
 """Where automatic exposure puts the mean of the lower two thirds: ground and what stands on it."""
 
@@ -58,13 +67,15 @@ def form_image(light: NDArrayFloat32, look: CameraLook, rng: np.random.Generator
 
     optics = _OPTICS[look.difficulty]
     height, width = light.shape[:2]
-    blurred = cv2.GaussianBlur(light, (0, 0), optics.blur_px).reshape(-1, 3)
+    blurred: NDArrayFloat32 = np.asarray(
+        cv2.GaussianBlur(light, (0, 0), optics.blur_px), dtype=np.float32
+    ).reshape(-1, 3)
     lower = light[height // 3 :: 8, ::8]
-    # The median of what is metered: a white wall or the sun must not darken the road.
+    # The sun in a window must not darken the road.
     mean = float(np.minimum(lower.mean(axis=2), 2.0).mean())
     exposure = _MEAN_LIGHT / max(mean, 1e-4) * np.exp(rng.normal(0.0, optics.exposure_jitter))
     balance = np.exp(rng.normal(0.0, optics.balance_jitter, 3))
-    gains = exposure * balance / balance.mean() * _white_balance(look.weather)
+    gains = exposure * balance / balance.mean() * np.array(_WHITE_BALANCE[look.weather])
     # Short of light, the gain is turned up, and the noise with it.
     gain = 1.6 if look.weather is Weather.DUSK else 1.0
     seed = int(rng.integers(1, 2**20))
@@ -91,16 +102,6 @@ def form_image(light: NDArrayFloat32, look: CameraLook, rng: np.random.Generator
     return picture.reshape(height, width, 3)
 
 
-def _white_balance(weather: Weather) -> NDArrayFloat32:
-    """(3,) gains; cameras take out most of the light's colour, not all of it."""
-    gains = {
-        Weather.CLEAR: (0.97, 1.0, 1.06),
-        Weather.DUSK: (0.88, 1.0, 1.18),
-        Weather.HAZE: (0.97, 1.0, 1.04),
-    }
-    return np.array(gains.get(weather, (1.0, 1.0, 1.0)), dtype=np.float32)
-
-
 @lru_cache(maxsize=1)
 def _tone_curve() -> NDArrayByte:
     """(4096,) uint8 over the square root of light, 0..2: a shoulder, then sRGB's curve (IEC 61966-2-1)."""
@@ -109,7 +110,8 @@ def _tone_curve() -> NDArrayByte:
     srgb = np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * shown ** (1 / 2.4) - 0.055)
     # A little contrast, as cameras add.
     srgb = srgb + 0.08 * np.sin(2 * np.pi * (srgb - 0.5)) * 0.5
-    return np.clip(np.rint(255 * srgb), 0, 255).astype(np.uint8)
+    curve: NDArrayByte = np.clip(np.rint(255 * srgb), 0, 255).astype(np.uint8)
+    return curve
 
 
 @lru_cache(maxsize=8)

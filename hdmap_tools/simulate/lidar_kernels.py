@@ -25,7 +25,7 @@ def turn_rays(
 
     The lidar turns clockwise, as Velodyne's do, and begins behind the vehicle.
 
-    Args:
+    Takes:
         first, last: Azimuths to do.
         elevations_rad: (R,).
         rotations, origins: (A, 3, 3) and (A, 3) of the lidar at each azimuth's time.
@@ -72,7 +72,7 @@ def receive(
 ) -> None:
     """Range and intensity of each return; a range of NaN where there is none.
 
-    Args:
+    Takes:
         first, last: Rays to do.
         num_rings: Lasers; ray i is of laser ``i % num_rings``.
         rays, t, normal, material, wear: Of the cast.

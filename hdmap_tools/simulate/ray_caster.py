@@ -235,10 +235,12 @@ def _indexed(mesh: Mesh) -> Any:
 
 def _cast(caster: Any, rays: NDArrayFloat32) -> tuple[NDArrayFloat32, NDArrayAny, NDArrayFloat32]:
     """Lengths, triangles and unit normals, turned towards the rays' origins."""
+    from hdmap_tools.simulate.compiled import in_bands
+    from hdmap_tools.simulate.ray_kernels import turn_normals
+
     answer = caster.cast_rays(open3d().core.Tensor.from_numpy(np.ascontiguousarray(rays)))
     normal: NDArrayFloat32 = answer["primitive_normals"].numpy()
-    away = np.einsum("ij,ij->i", normal, rays[:, 3:]) > 0
-    normal[away] *= -1
+    in_bands(lambda first, last: turn_normals(first, last, rays, normal), len(rays))
     return answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), normal
 
 

@@ -35,6 +35,15 @@ def pixel_rays(
 
 
 @compiled
+def turn_normals(first: int, last: int, rays: NDArrayFloat32, normal: NDArrayFloat32) -> None:
+    """Turn normals (N, 3) towards where the rays come from."""
+    for i in range(first, last):
+        if normal[i, 0] * rays[i, 3] + normal[i, 1] * rays[i, 4] + normal[i, 2] * rays[i, 5] > 0.0:
+            for k in range(3):
+                normal[i, k] = -normal[i, k]
+
+
+@compiled
 def resolve_materials(
     first: int,
     last: int,
@@ -51,7 +60,7 @@ def resolve_materials(
 ) -> None:
     """Materials of hits; those of the ground from the surface raster.
 
-    Args:
+    Takes:
         first, last: Rows to do.
         rays, t, triangle: Of the cast; no hit where t is infinite.
         triangle_materials: (T,) of the mesh.

@@ -53,11 +53,12 @@ _PITCH_DEG: Final = 2.0
 
 
 def cameras_of(rig: CameraRig, width_px: int = 960, height_px: int = 600) -> list[PinholeCamera]:
-    """The cameras of a rig; names are Argoverse 2's, images are rectified.
+    """The cameras of a rig; names are Argoverse 2's, images are rectified, pixels square.
 
     Args:
         rig: Which cameras.
-        width_px, height_px: Of each image; the horizontal field of view is 70 degrees.
+        width_px: Of each image; its horizontal field of view is 70 degrees.
+        height_px: Of each image.
     """
     return [_camera(name, width_px, height_px) for name in _RIGS[rig]]
 

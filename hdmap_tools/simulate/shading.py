@@ -6,7 +6,7 @@ fixed in the world, and the air between.
 
 from __future__ import annotations
 
-from math import exp, floor, log2, sqrt
+from math import cos, exp, floor, log2, sin, sqrt
 
 from hdmap_tools.simulate.compiled import compiled_fast, compiled_inline
 from hdmap_tools.simulate.light import Light
@@ -78,6 +78,74 @@ def sun_rays(
             result[j, 3 + k] = light.sun_direction[k] + light.sun_blur * (
                 2.0 * hash_unit(i, k, light.noise_seed) - 1.0
             )
+
+
+@compiled_fast
+def sky_rays(
+    first: int,
+    last: int,
+    rows: NDArrayAny,
+    rays: NDArrayFloat32,
+    t: NDArrayFloat32,
+    normal: NDArrayFloat32,
+    seed: int,
+    result: NDArrayFloat32,
+) -> None:
+    """A ray each from hits to some place of the sky before them, more often where it counts more."""
+    for j in range(first, last):
+        i = rows[j]
+        lift = 0.01 + 1e-4 * t[i]
+        # A point of the ball that touches the surface: cosine-weighted directions.
+        up = 2.0 * hash_unit(i, 0, seed) - 1.0
+        around = 6.2831853 * hash_unit(i, 1, seed)
+        wide = sqrt(max(1.0 - up * up, 0.0))
+        ball = (wide * cos(around), wide * sin(around), up)
+        for k in range(3):
+            result[j, k] = rays[i, k] + t[i] * rays[i, 3 + k] + lift * normal[i, k]
+            result[j, 3 + k] = 1.02 * normal[i, k] + ball[k]
+
+
+@compiled_fast
+def spread_sunlight(
+    first: int,
+    last: int,
+    traced: NDArrayByte,
+    on_ground: NDArrayAny,
+    t: NDArrayFloat32,
+    normal: NDArrayFloat32,
+    sunlight: NDArrayFloat32,
+) -> None:
+    """Sunlight 0..1 of all pixels from those of every second one that were asked.
+
+    The mean over the neighbours, of three by three, that lie on the same surface: half
+    the rays, and edges of shadows as soft as a pixel.
+
+    Takes:
+        first, last: Image rows to do.
+        traced: (h, w) uint8: 0 in shadow, 1 in the sun, 2 not asked.
+        on_ground, t, normal: (h, w) and (h, w, 3) of the hits.
+        sunlight: (h, w) written.
+    """
+    height, width = traced.shape
+    for row in range(first, last):
+        for col in range(width):
+            total = 0.0
+            count = 0
+            for i in range(max(row - 1, 0), min(row + 2, height)):
+                for j in range(max(col - 1, 0), min(col + 2, width)):
+                    if traced[i, j] == 2 or on_ground[i, j] != on_ground[row, col]:
+                        continue
+                    if not on_ground[row, col]:
+                        alike = (
+                            normal[i, j, 0] * normal[row, col, 0]
+                            + normal[i, j, 1] * normal[row, col, 1]
+                            + normal[i, j, 2] * normal[row, col, 2]
+                        )
+                        if alike < 0.5 or abs(t[i, j] - t[row, col]) > 0.05 * t[row, col]:
+                            continue
+                    total += traced[i, j]
+                    count += 1
+            sunlight[row, col] = total / count if count > 0 else 1.0
 
 
 @compiled_inline
@@ -162,7 +230,7 @@ def shade(
     material: NDArrayByte,
     normal: NDArrayFloat32,
     on_ground: NDArrayAny,
-    in_sun: NDArrayAny,
+    sunlight: NDArrayFloat32,
     open_sky: NDArrayFloat32,
     origin: NDArrayFloat,
     focal_px: float,
@@ -180,11 +248,11 @@ def shade(
 ) -> None:
     """Light of each ray, written to image (N, 3) float32.
 
-    Args:
+    Takes:
         first, last: Rows to do.
         rays: (N, 6) from the scene's origin; directions of length one along the optical axis.
         t, material, normal, on_ground: Of the hits.
-        in_sun: (N,) bool: nothing stands between hit and sun.
+        sunlight: (N,) float32 part of the sun that nothing hides.
         open_sky: (N,) float32 part of the sky's light that reaches the hit.
         origin: (3,) of the scene, city frame: what varies is fixed in the city.
         focal_px: Of the camera.
@@ -241,11 +309,11 @@ def shade(
             )
 
         gloss = 0.0
-        if answer == ASPHALT or answer == PAINT:
+        if answer in (ASPHALT, PAINT):
             factor = _ground_variation(cx, cy, footprint_m, amplitude, seed)
             gloss = 0.25 * light.wet
         elif answer == PAVING:
-            factor = _ground_variation(cx, cy, footprint_m, 0.7 * amplitude, seed + 40)
+            factor = _ground_variation(cx, cy, max(footprint_m, 0.06), 0.7 * amplitude, seed + 40)
             joint = _grain(0.35, footprint_m)
             if joint > 0.0:
                 column, row = floor(cx / 0.5), floor(cy / 0.5)
@@ -253,7 +321,7 @@ def shade(
                     factor *= 1.0 - 0.3 * joint
                 factor *= 1.0 + 0.08 * joint * (hash_unit(int(column), int(row), seed) - 0.5)
             gloss = 0.15 * light.wet
-        elif answer == LEAVES or answer == LAWN:
+        elif answer in (LEAVES, LAWN):
             # Leaves: clumps with their own slope towards the light, and dark gaps.
             value = 0.6 * noise3(cx * 0.9, cy * 0.9, cz * 0.9, seed + 50)
             scale = 3.5
@@ -270,7 +338,7 @@ def shade(
             tint = noise2(cx * 0.15, cy * 0.15, seed + 55)
             red *= 1.0 + 0.35 * tint
             blue *= 1.0 + 0.15 * tint
-            bend = 0.55 if answer == LEAVES else 0.2
+            bend = 0.9 if answer == LEAVES else 0.2
             nx += bend * noise3(cx * 5.0, cy * 5.0, cz * 5.0, seed + 56)
             ny += bend * noise3(cx * 5.0, cy * 5.0, cz * 5.0, seed + 57)
             nz += bend * noise3(cx * 5.0, cy * 5.0, cz * 5.0, seed + 58)
@@ -279,15 +347,14 @@ def shade(
         elif answer == BRICK:
             across = cx * ny - cy * nx
             factor = 1.0 + amplitude * noise3(cx * 0.6, cy * 0.6, cz * 0.6, seed + 60)
-            fine = _grain(0.15, footprint_m)
+            course = floor(cz / 0.08)
+            along = across / 0.25 + 0.5 * (course % 2)
+            fine = _grain(0.06, across_m)
             if fine > 0.0:
-                course = floor(cz / 0.08)
-                along = across / 0.25 + 0.5 * (course % 2)
-                factor *= 1.0 + 0.25 * fine * (
-                    hash_unit(int(floor(along)), int(course), seed) - 0.5
-                )
-                if cz / 0.08 - course < 0.13 or along - floor(along) < 0.04:
-                    factor *= 1.0 + 0.5 * fine
+                factor *= 1.0 + 0.25 * fine * (hash_unit(floor(along), course, seed) - 0.5)
+            mortar = _grain(0.01, across_m)
+            if mortar > 0.0 and (cz / 0.08 - course < 0.13 or along - floor(along) < 0.04):
+                factor *= 1.0 + 0.5 * mortar
         else:
             factor = (
                 1.0
@@ -302,9 +369,9 @@ def shade(
 
         n_dot_sun = nx * sx + ny * sy + nz * sz
         if answer == LEAVES:
-            # Some of the sun shines through.
-            n_dot_sun = max(n_dot_sun, 0.0) * 0.8 + 0.2 * abs(n_dot_sun)
-        sunlit = max(n_dot_sun, 0.0) if in_sun[i] else 0.0
+            # Some of the sun shines through, and leaves face all ways.
+            n_dot_sun = max(n_dot_sun, 0.0) * 0.7 + 0.2 * abs(n_dot_sun) + 0.1
+        sunlit = max(n_dot_sun, 0.0) * sunlight[i]
         sky = open_sky[i] * (0.5 + 0.5 * nz)
         bounce = _SKY_COLOUR_OF_GROUND * (0.5 - 0.5 * nz) + 0.06
         red *= factor * (light.sun[0] * (sunlit + 0.4 * bounce) + light.ambient[0] * (sky + bounce))
@@ -315,7 +382,7 @@ def shade(
             light.sun[2] * (sunlit + 0.4 * bounce) + light.ambient[2] * (sky + bounce)
         )
 
-        if answer == GLASS or answer == LACQUER or gloss > 0.0:
+        if answer in (GLASS, LACQUER) or gloss > 0.0:
             along_normal = 2.0 * (nx * dx + ny * dy + nz * dz)
             mx, my, mz = dx - along_normal * nx, dy - along_normal * ny, dz - along_normal * nz
             fresnel = 0.04 + 0.96 * (1.0 - min(facing, 1.0)) ** 5
@@ -360,7 +427,7 @@ def finish(
 ) -> None:
     """Exposure, vignetting, noise of photons and electronics, and the tone curve, to uint8.
 
-    Args:
+    Takes:
         first, last: Pixels to do.
         width: Of the image.
         image: (N, 3) light on the sensor.
