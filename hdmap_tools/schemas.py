@@ -26,6 +26,7 @@ from hdmap_tools.formats.records import METADATA_VERSION
 from hdmap_tools.fusion.intensity_likelihood import IntensityDocument
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.map_model.elements import ELEMENT_TYPES, MapElement
+from hdmap_tools.point_map.point_map import POINT_MAP_VERSION, PointMapMeta
 from hdmap_tools.run_metrics import RunMetrics
 from hdmap_tools.segmentation.confusion import ConfusionDocument
 from hdmap_tools.segmentation.segmenter import ModelProfile
@@ -44,6 +45,7 @@ _MODELS: Final[tuple[tuple[str, type[BaseModel], int, _Mode], ...]] = (
     ("confusion_matrix", ConfusionDocument, 1, "validation"),
     ("intensity_likelihood", IntensityDocument, 1, "validation"),
     ("mask", MaskSidecar, 1, "validation"),
+    ("point_map", PointMapMeta, POINT_MAP_VERSION, "validation"),
     ("raster_comparison", RasterComparison, 1, "serialization"),
     ("paper_scores", PaperScores, 1, "serialization"),
     ("reliability", ReliabilityReport, 1, "serialization"),

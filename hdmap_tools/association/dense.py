@@ -13,19 +13,15 @@ from typing import Final
 
 import numpy as np
 
-from hdmap_tools.association.lookup import (
-    labels_at,
-    project_city,
-    speaks_of_ground,
-)
+from hdmap_tools.association.lookup import speaks_of_ground
 from hdmap_tools.association.observations import Observations
-from hdmap_tools.association.visibility import is_unoccluded
+from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, widened
 from hdmap_tools.config import AssociationConfig
-from hdmap_tools.geometry.camera import PinholeCamera, Projection
+from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.point_map.values import MapPoints
-from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
 
 
 def clip_bounds_m(
@@ -62,46 +58,44 @@ def associate_dense(
             metres; None without a sweep.
         ring_gap_deg: Angle between that sweep's rings, degrees.
     """
+    from hdmap_tools.association.dense_kernels import lay_depth, look_up, see_points
+
+    cam_SE3_city = (city_SE3_ego @ camera.ego_SE3_cam).inverse()
     ego_SE3_city = city_SE3_ego.inverse()
-    points_ego = ego_SE3_city.transform_from(points.points_city)
-    clip = (points_ego[:, 0] > 0.0) & (points_ego[:, 0] <= config.clip_ahead_m)
-    clip &= np.abs(points_ego[:, 1]) <= config.clip_across_m
-    from_camera = points_ego[:, :2] - camera.ego_SE3_cam.translation[:2]
-    use = clip & points.is_ground
-    use &= (from_camera**2).sum(axis=1) >= config.min_range_m**2
-    at = np.flatnonzero(use)
-    projection = camera.project(points_ego[at])
-    seen = projection.is_valid
+    view = (cam_SE3_city.rotation, cam_SE3_city.translation, *camera.lens)
+    seen = see_points(
+        points.points_city,
+        ego_SE3_city.rotation,
+        ego_SE3_city.translation,
+        (config.clip_ahead_m, config.clip_across_m, config.min_range_m),
+        camera.ego_SE3_cam.translation,
+        *view,
+    )
+    hides_from_m = np.zeros((0, 0))
     if config.occlusion_test:
-        in_map = camera.project(points_ego[clip & ~points.is_ground])
-        seen = _unoccluded(projection, in_map, camera, _MAP_GAP_DEG, _MAP_GAP_DEG)
+        shape = (-(-camera.height_px // CELL_PX), -(-camera.width_px // CELL_PX))
+        depth = np.full(shape, np.inf)
+        lay_depth(depth, *seen, points.is_ground, CELL_PX, NEAREST_M)
+        hides_from_m = widened(depth, camera, _MAP_GAP_DEG, _MAP_GAP_DEG) + MARGIN_M
         if standing_city is not None and len(standing_city):
-            live = project_city(standing_city, camera, city_SE3_ego)
-            seen &= _unoccluded(projection, live, camera, 0.4, ring_gap_deg)
-    labels = labels_at(label_image, projection.uv[seen])
-    speaks = speaks_of_ground(labels, label_set)
-    at = at[seen][speaks]
-    return Observations(points.points_city[at], labels[speaks], points.intensity[at])
+            live = see_points(
+                standing_city,
+                ego_SE3_city.rotation,
+                ego_SE3_city.translation,
+                (np.inf, np.inf, 0.0),
+                camera.ego_SE3_cam.translation,
+                *view,
+            )
+            depth = np.full(shape, np.inf)
+            lay_depth(depth, *live, np.zeros(len(standing_city), bool), CELL_PX, NEAREST_M)
+            live_from_m = widened(depth, camera, _SWEEP_GAP_DEG, ring_gap_deg) + MARGIN_M
+            hides_from_m = np.minimum(hides_from_m, live_from_m)
+    speaks = speaks_of_ground(np.arange(256, dtype=np.uint8), label_set)
+    at, labels = look_up(*seen, points.is_ground, hides_from_m, CELL_PX, label_image, speaks)
+    return Observations(points.points_city[at], labels, points.intensity[at])
 
 
 _MAP_GAP_DEG: Final = 0.4
 """Angle that a point of the map covers: 10 cm at 15 m."""
-
-
-def _unoccluded(
-    ground: Projection,
-    occluders: Projection,
-    camera: PinholeCamera,
-    gap_h_deg: float,
-    gap_v_deg: float,
-) -> NDArrayBool:
-    both = Projection(
-        np.concatenate([ground.uv, occluders.uv]),
-        np.concatenate([ground.depth_m, occluders.depth_m]),
-        np.concatenate([ground.is_valid, occluders.is_valid]),
-    )
-    count = len(ground.depth_m)
-    is_occluder = np.arange(len(both.depth_m)) >= count
-    return is_unoccluded(both, is_occluder, camera, gap_h_deg=gap_h_deg, gap_v_deg=gap_v_deg)[
-        :count
-    ]
+_SWEEP_GAP_DEG: Final = 0.4
+"""Angle between a sweep's returns within a ring."""

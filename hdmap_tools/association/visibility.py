@@ -10,12 +10,13 @@ from scipy.ndimage import minimum_filter
 from hdmap_tools.geometry.camera import PinholeCamera, Projection
 from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
 
-_CELL_PX: Final = 4
-_NEAREST_M: Final = 2.0
+CELL_PX: Final = 4
+"""Edge of the depth buffer's cells."""
+NEAREST_M: Final = 2.0
 """Nearer returns come from the vehicle itself: roof, bonnet, the sensors' own mounts."""
 _LIDAR_HEIGHT_M: Final = 1.8
 _WIDEST_RING_GAP_DEG: Final = 2.1
-_MARGIN_M: Final = 0.5
+MARGIN_M: Final = 0.5
 """A point must lie this much behind an occluder; covers extent and timing of moving things."""
 
 
@@ -44,23 +45,30 @@ def is_unoccluded(
         (N,) bool; False for points that are not in the image.
     """
     visible = projection.is_valid.copy()
-    blockers = projection.is_valid & is_occluder & (projection.depth_m > _NEAREST_M)
+    blockers = projection.is_valid & is_occluder & (projection.depth_m > NEAREST_M)
     if not blockers.any():
         return visible
-    shape = (-(-camera.height_px // _CELL_PX), -(-camera.width_px // _CELL_PX))
+    shape = (-(-camera.height_px // CELL_PX), -(-camera.width_px // CELL_PX))
     depth = np.full(shape, np.inf)
     cell = np.zeros((len(visible), 2), dtype=np.int64)
-    cell[projection.is_valid] = np.floor((projection.uv[projection.is_valid] + 0.5) / _CELL_PX)
+    cell[projection.is_valid] = np.floor((projection.uv[projection.is_valid] + 0.5) / CELL_PX)
     np.minimum.at(depth, (cell[blockers, 1], cell[blockers, 0]), projection.depth_m[blockers])
+    depth = widened(depth, camera, gap_h_deg, gap_v_deg)
+    behind = projection.depth_m > depth[cell[:, 1], cell[:, 0]] + MARGIN_M
+    return np.asarray(visible & ~(behind & ~is_occluder))
+
+
+def widened(
+    depth: NDArrayFloat, camera: PinholeCamera, gap_h_deg: float, gap_v_deg: float
+) -> NDArrayFloat:
+    """A depth buffer in cells of `CELL_PX` in which each occluder covers the gaps around it."""
     # A whole gap up and down, not half of one: below the lowest ring that meets a thing,
     # its foot reaches down to the next, which may have met the ground before it.
     reach = (
-        _odd(2.0 * np.deg2rad(gap_v_deg) * camera.fy / _CELL_PX),
-        _odd(np.deg2rad(gap_h_deg) * camera.fx / _CELL_PX),
+        _odd(2.0 * np.deg2rad(gap_v_deg) * camera.fy / CELL_PX),
+        _odd(np.deg2rad(gap_h_deg) * camera.fx / CELL_PX),
     )
-    depth = minimum_filter(depth, size=reach, mode="constant", cval=np.inf)
-    behind = projection.depth_m > depth[cell[:, 1], cell[:, 0]] + _MARGIN_M
-    return np.asarray(visible & ~(behind & ~is_occluder))
+    return np.asarray(minimum_filter(depth, size=reach, mode="constant", cval=np.inf))
 
 
 def ring_gap_deg(points_ego: NDArrayFloat, ring: NDArrayByte) -> float:

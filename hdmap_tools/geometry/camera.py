@@ -94,6 +94,16 @@ class PinholeCamera:
         """Whether the lens model has any distortion."""
         return any(k != 0.0 for k in self.distortion)
 
+    @property
+    def lens(self) -> tuple[tuple[float, ...], tuple[int, int], float]:
+        """What compiled projections need.
+
+        Intrinsics and distortion (fx, fy, cx, cy, k1, k2, p1, p2, k3); width and height; and
+        the largest distance from the axis, at depth one, for which the distortion holds.
+        """
+        intrinsics = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        return intrinsics, (self.width_px, self.height_px), self._max_radius
+
     def project(self, points_ego: NDArrayFloat) -> Projection:
         """Project ego-frame points (N, 3), metres, into the image.
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from hdmap_tools.config import Config
 from hdmap_tools.point_map.build import PosedDrive, Progress, build_point_map
+from hdmap_tools.point_map.from_cloud import build_from_file
+from hdmap_tools.point_map.point_files import is_point_file
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.readers.drive import Drive
 
@@ -49,6 +51,11 @@ def with_points(
             max_pose_gap_s=config.drive.max_pose_gap_s,
             progress=progress,
         )
+    elif is_point_file(path):
+        made = scratch / "points"
+        made.mkdir(parents=True)
+        point_map = build_from_file(path, made, config.points, drive.frame)
+        path = made
     else:
         point_map = PointMap.open(path)
     frame = point_map.meta.frame

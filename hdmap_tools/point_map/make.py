@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from hdmap_tools.config import Config
-from hdmap_tools.errors import PointMapError
+from hdmap_tools.errors import ConfigError, PointMapError
+from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.opening import open_configured
 from hdmap_tools.output_folder import result_folder
 from hdmap_tools.point_map.build import Progress, build_point_map
 from hdmap_tools.point_map.for_drive import posed_drives
+from hdmap_tools.point_map.from_cloud import build_from_file
+from hdmap_tools.point_map.point_files import check_writable, is_point_file, write_point_file
+from hdmap_tools.readers.drive import Drive
 
 COMMAND: Final = "points"
 """Under this name the output folder is marked."""
@@ -30,7 +35,7 @@ def make_points(
     """Make a point map from drives.
 
     Args:
-        sources: Folders of drives.
+        sources: Folders of drives, or one point cloud.
         out: Folder to make.
         config: `points`, `drive` and the place on earth.
         exports: Files to write all points to.
@@ -44,21 +49,58 @@ def make_points(
         HDMapError: Whatever cannot be read, made or written; then nothing is left behind.
     """
     start = time.perf_counter()
+    for path in exports:
+        check_writable(path, overwrite)
+    files = [path for path in sources if is_point_file(path)]
     with result_folder(out, COMMAND, overwrite) as folder:
-        drives = [open_configured(config, path) for path in sources]
-        if len({drive.id for drive in drives}) < len(drives):
-            raise PointMapError("Two of the drives have the same id; give each drive once.")
-        made = build_point_map(
-            posed_drives(drives, config),
-            folder,
-            config.points,
-            max_pose_gap_s=config.drive.max_pose_gap_s,
-            progress=progress,
-        )
+        if files:
+            if len(sources) > 1:
+                raise PointMapError(
+                    f"A point cloud ({files[0].name}) is taken alone; found {len(sources)} sources."
+                )
+            frame = MapFrame() if config.export.origin is None else _frame_at(config)
+            names = [files[0].name]
+            made = build_from_file(files[0], folder, config.points, frame)
+        else:
+            drives = [open_configured(config, path) for path in sources]
+            drives = [_placed(drive, config) for drive in drives]
+            if len({drive.id for drive in drives}) < len(drives):
+                raise PointMapError("Two of the drives have the same id; give each drive once.")
+            names = [drive.id for drive in drives]
+            made = build_point_map(
+                posed_drives(drives, config),
+                folder,
+                config.points,
+                max_pose_gap_s=config.drive.max_pose_gap_s,
+                progress=progress,
+            )
+        for path in exports:
+            parts = (made.read_tile(index).to_points(index) for index in made.tile_indices())
+            write_point_file(path, parts, made.meta.frame, overwrite)
         return {
-            "sources": [drive.id for drive in drives],
+            "sources": names,
             "num_points": made.num_points,
             "num_tiles": len(made.tile_indices()),
             "refined_poses": {drive.id: drive.is_refined for drive in made.meta.drives},
             "seconds": round(time.perf_counter() - start, 3),
         }
+
+
+def _frame_at(config: Config) -> MapFrame:
+    assert config.export.origin is not None
+    return MapFrame.from_origin(*config.export.origin)
+
+
+def _placed(drive: Drive, config: Config) -> Drive:
+    """The drive with the origin given, if it does not know its own.
+
+    Raises:
+        ConfigError: If it does.
+    """
+    if config.export.origin is None:
+        return drive
+    if drive.frame.is_georeferenced:
+        raise ConfigError(
+            f"Drive {drive.name} knows its place on earth ({drive.frame.describe()}); leave --origin out."
+        )
+    return replace(drive, frame=_frame_at(config))
