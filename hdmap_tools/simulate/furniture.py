@@ -8,9 +8,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
 
 from hdmap_tools.simulate.materials import Mat
 from hdmap_tools.simulate.scene import Mesh
+from hdmap_tools.simulate.terrain import Terrain
 from hdmap_tools.types import NDArrayAny, NDArrayFloat
 
 _BOX = np.array(
@@ -36,7 +39,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], mat: 
     (x0, y0, z0), (x1, y1, z1) = low, high
     ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     corners = [(x, y, z) for z in (z0, z1) for x, y in ring]
-    return mesh_of(corners, _BOX, int(mat))
+    return mesh_of(np.array(corners), _BOX, int(mat))
 
 
 def prism(
@@ -124,6 +127,64 @@ def building(
     return Mesh.merged(parts)
 
 
+def outlined_building(
+    outline: BaseGeometry,
+    corner: NDArrayFloat,
+    inner: BaseGeometry,
+    terrain: Terrain,
+    top_m: float,
+    mat: Mat,
+) -> Mesh:
+    """A flat-roofed block over any outline, with windows in its longer walls.
+
+    Args:
+        outline: A polygon, city metres.
+        corner: (2,) what becomes the mesh's origin, so that float32 keeps its precision.
+        inner: Line along which the outline was cut and no wall stands.
+        terrain: What it stands on.
+        top_m: Height of its roof.
+        mat: Of its walls.
+    """
+    vertices: list[NDArrayAny] = []
+    materials: list[int] = []
+    outline = shapely.orient_polygons(outline)
+    # What is built lies on the left of every ring, the outside on its right.
+    for ring in (outline.exterior, *outline.interiors):
+        xy = shapely.get_coordinates(ring)
+        ground = terrain.height_at(xy)
+        for k in range(len(xy) - 1):
+            a, b = xy[k], xy[k + 1]
+            length = float(np.linalg.norm(b - a))
+            if length < 1e-6 or shapely.Point((a + b) / 2).distance(inner) < 1e-6:
+                continue
+            low = float(min(ground[k], ground[k + 1]))
+            vertices.append(_panel(a, b, low - 1.0, top_m))
+            materials.append(int(mat))
+            along = (b - a) / length
+            out = np.array([along[1], -along[0]]) * 0.03
+            for u in np.arange(1.6, length - 1.5, 2.8):
+                for z in np.arange(low + 1.2, top_m - 1.8, 3.1):
+                    left = a + along * (u - 0.55) + out
+                    vertices.append(_panel(left, left + along * 1.1, z, z + 1.5))
+                    materials.append(int(Mat.WINDOW))
+    quads = np.array(vertices).reshape(-1, 4, 3) - (*corner, 0.0)
+    at = 4 * np.arange(len(quads))[:, None]
+    walls = np.stack([at + [0, 1, 2], at + [0, 2, 3]], axis=1).reshape(-1, 3)
+    split = shapely.get_parts(shapely.constrained_delaunay_triangles(outline))
+    flat = shapely.get_coordinates(shapely.orient_polygons(split)).reshape(-1, 4, 2)[:, :3]
+    roof = np.column_stack([flat.reshape(-1, 2) - corner, np.full(3 * len(flat), top_m)])
+    return Mesh.merged(
+        [
+            mesh_of(quads.reshape(-1, 3), walls, np.repeat(materials, 2)),
+            mesh_of(roof, np.arange(len(roof)).reshape(-1, 3), int(Mat.ROOF)),
+        ]
+    )
+
+
+def _panel(a: NDArrayFloat, b: NDArrayFloat, low: float, high: float) -> NDArrayAny:
+    return np.array([[*a, low], [*b, low], [*b, high], [*a, high]])
+
+
 def _icosphere() -> tuple[NDArrayFloat, NDArrayAny]:
     """42 points and 80 triangles on the unit sphere."""
     g = (1 + 5**0.5) / 2
@@ -183,7 +244,7 @@ def lamp(height_m: float) -> Mesh:
 
 
 def sign(kind: int) -> Mesh:
-    """A traffic sign on a pole that faces those who come along x: its face looks to −x.
+    """A traffic sign on a pole that faces those who come along x: its face looks to -x.
 
     Args:
         kind: 0 round, 1 triangular, 2 square.
@@ -192,14 +253,14 @@ def sign(kind: int) -> Mesh:
     angles = turn + np.arange(sides) * 2 * np.pi / sides
     y, z = 0.36 * np.cos(angles), 2.4 + 0.36 * np.sin(angles)
     fan = np.array([[0, k, k + 1] for k in range(1, sides - 1)])
-    # Seen from −x, y runs to the right reversed: the fan turned over faces −x.
+    # Seen from -x, y runs to the right reversed: the fan turned over faces -x.
     face = mesh_of(np.column_stack([np.full(sides, -0.06), y, z]), fan[:, ::-1], int(Mat.SIGN))
     back = mesh_of(np.column_stack([np.full(sides, -0.045), y, z]), fan, int(Mat.SIGN_BACK))
     return Mesh.merged([prism(0.035, -0.3, 2.7, Mat.POLE, 6), face, back])
 
 
 def traffic_light() -> Mesh:
-    """A signal on a pole beside the road, facing −x."""
+    """A signal on a pole beside the road, facing -x."""
     return Mesh.merged(
         [
             prism(0.07, -0.3, 3.3, Mat.POLE, 8),
@@ -225,7 +286,7 @@ def hedge(length_m: float, height_m: float, rng: np.random.Generator) -> Mesh:
     ring = len(profile)
     points = np.array([[(xi, y, z) for y, z in profile] for xi in x])
     points[:, 1:-1, 1:] += rng.uniform(-0.07, 0.07, (n + 1, ring - 2, 2))
-    faces = []
+    faces: list[tuple[int, ...]] = []
     for k in range(n):
         for j in range(ring - 1):
             a, b = k * ring + j, k * ring + j + 1

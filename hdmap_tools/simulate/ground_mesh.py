@@ -10,7 +10,6 @@ import shapely
 from hdmap_tools.simulate.materials import Mat
 from hdmap_tools.simulate.road_area import RoadArea
 from hdmap_tools.simulate.scene import Mesh
-from hdmap_tools.simulate.surface import TILE_M
 from hdmap_tools.simulate.terrain import Terrain
 from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat
 
@@ -76,39 +75,26 @@ def _grid_mesh(
 
 def raised_mesh(ix: int, iy: int, area: RoadArea, terrain: Terrain, origin: NDArrayFloat) -> Mesh:
     """What lies beside the road in one tile, raised, with the faces of the kerbs."""
-    corner = np.array([ix, iy]) * TILE_M
-    k = np.arange(_PER_TILE)
-    lows_x, lows_y = np.meshgrid(corner[0] + k * STEP_M, corner[1] + k * STEP_M)
-    cells = shapely.box(lows_x, lows_y, lows_x + STEP_M, lows_y + STEP_M).ravel()
+    nodes = np.arange(_PER_TILE + 1)
+    x, y = np.meshgrid((ix * _PER_TILE + nodes) * STEP_M, (iy * _PER_TILE + nodes) * STEP_M)
+    lows = (x[:-1, :-1], y[:-1, :-1])
+    cells = shapely.box(*lows, x[1:, 1:], y[1:, 1:]).ravel()
     road = area.prepared
     touches = shapely.intersects(road, cells)
     inside = shapely.contains_properly(road, cells)
-    whole = cells[~touches]
     parts = shapely.difference(cells[touches & ~inside], area.drivable)
     pieces = shapely.get_parts(parts)
     pieces = pieces[(shapely.get_type_id(pieces) == 3) & (shapely.area(pieces) > 1e-8)]
-    return Mesh.merged(
-        [_caps(whole, area, terrain, origin), _caps_and_faces(pieces, area, terrain, origin)]
-    )
-
-
-def _caps(cells: NDArrayAny, area: RoadArea, terrain: Terrain, origin: NDArrayFloat) -> Mesh:
-    if len(cells) == 0:
-        return Mesh.merged([])
-    x0, y0, x1, y1 = shapely.bounds(cells).T
-    corners = np.stack(
-        [
-            np.column_stack([x0, y0]),
-            np.column_stack([x1, y0]),
-            np.column_stack([x1, y1]),
-            np.column_stack([x0, y1]),
-        ],
-        axis=1,
-    )
-    xy = corners.reshape(-1, 2)
-    at = 4 * np.arange(len(cells))[:, None]
-    triangles = np.concatenate([at + [0, 1, 2], at + [0, 2, 3]])
-    return _raised(xy, triangles, area, terrain, origin)
+    rows, cols = np.divmod(np.nonzero(~touches)[0], _PER_TILE)
+    a = rows * (_PER_TILE + 1) + cols
+    b, c, d = a + 1, a + _PER_TILE + 2, a + _PER_TILE + 1
+    triangles = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    caps = Mesh.merged([])
+    if len(triangles):
+        used, renumbered = np.unique(triangles, return_inverse=True)
+        xy = np.column_stack([x.ravel(), y.ravel()])[used]
+        caps = _raised(xy, renumbered.reshape(-1, 3), area, terrain, origin)
+    return Mesh.merged([caps, _caps_and_faces(pieces, area, terrain, origin)])
 
 
 def _caps_and_faces(

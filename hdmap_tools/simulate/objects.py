@@ -49,6 +49,7 @@ class Placed:
         yaw_rad: Of its x axis.
         rank: The higher gets the ground.
         rng_place: Seeds its shape.
+        size: Width along x and depth of a building, height twice of a tree; metres.
     """
 
     footprint: BaseGeometry
@@ -159,22 +160,28 @@ class RoadsideObjects:
         return meshes
 
     def _mapped_buildings(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
-        """Buildings that the map knows, as blocks over their outline's rectangle."""
+        """What of the map's buildings stands in a tile, off the road, as blocks over their outline."""
         meshes = []
+        box = shapely.box(*corner, *(corner + TILE_M))
+        area = self._area(tile)
         for polygon in self.index.world.areas.get("building", ()):
-            centre = np.array([polygon.centroid.x, polygon.centroid.y])
-            if tuple(np.floor(centre / TILE_M).astype(int)) != tile:
+            if not polygon.intersects(box):
                 continue
-            ring = shapely.get_coordinates(polygon.minimum_rotated_rectangle)
-            sides = np.diff(ring[:3], axis=0)
-            width, depth = (float(np.linalg.norm(s)) for s in sides)
-            middle = (ring[0] + ring[2]) / 2
+            middle = np.array([polygon.centroid.x, polygon.centroid.y])
             rng = rng_at(self.settings.seed, Purpose.LOT, *np.round(middle).astype(int))
             wall = _WALLS[int(rng.integers(len(_WALLS)))]
-            shape = furniture.building(width, depth, float(rng.uniform(6, 18)), wall, rng)
-            meshes.append(
-                self._stand(shape, middle, float(np.arctan2(*sides[0][::-1])), corner, 0.1)
-            )
+            top = float(self.terrain.height_at(middle[None])[0] + rng.uniform(6, 18))
+            part = shapely.intersection(polygon, box)
+            part = shapely.difference(part, area.drivable.buffer(1.5))
+            for piece in shapely.get_parts(part):
+                if piece.geom_type != "Polygon" or piece.area < 1.0:
+                    continue
+                # Walls along the tile's own sides are inside the building.
+                meshes.append(
+                    furniture.outlined_building(
+                        piece, corner, box.exterior, self.terrain, top, wall
+                    )
+                )
         return meshes
 
     # Vegetation

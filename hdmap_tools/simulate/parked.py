@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -17,8 +18,8 @@ from hdmap_tools.simulate.surface import TILE_M, block_of_tile, lane_centre
 from hdmap_tools.simulate.terrain import Terrain
 from hdmap_tools.types import NDArrayFloat
 
-ROUTE_CLEAR_M: Final = 2.3
-"""Between the line that is driven and any parked vehicle."""
+ROUTE_CLEAR_M: Final = 2.3 + vehicles.MIRROR_M
+"""Between the line that is driven and the side of a parked vehicle, whose mirrors reach further."""
 
 _LANE_CLEAR_M: Final = 1.25
 """Between the middle of any lane and a parked vehicle: others drive there."""
@@ -109,6 +110,7 @@ def _places(
     return chosen
 
 
+@lru_cache(maxsize=400)
 def _candidates(
     index: WorldIndex, settings: SimulationSettings, tile: tuple[int, int]
 ) -> list[tuple[tuple[int, int, int], NDArrayFloat, float, float]]:

@@ -283,7 +283,7 @@ def _direction_at_end(xy: NDArrayFloat) -> NDArrayFloat:
     if len(xy) < 2:
         return np.zeros(2)
     ahead = xy[-1] - xy[max(len(xy) - 3, 0)]
-    return ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    return np.asarray(ahead / max(float(np.linalg.norm(ahead)), 1e-9))
 
 
 def _kerb_samples(

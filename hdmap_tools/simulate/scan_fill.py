@@ -45,7 +45,7 @@ def fill_area(
         starts = np.concatenate([ring[:-1] for ring in rings])
         ends = np.concatenate([ring[1:] for ring in rings])
         edges = np.concatenate([starts - corner_m, ends - corner_m], axis=1) / cell_m
-        _fill(cells, edges, np.array([0, len(edges)]), code, may_cover)
+        _fill(cells, edges, np.array([0, len(edges)]), int(code), may_cover)
 
 
 def fill_quads(
@@ -62,7 +62,7 @@ def fill_quads(
     scaled = (quads - np.asarray(corner_m)) / cell_m
     edges = np.concatenate([scaled, np.roll(scaled, -1, axis=1)], axis=2)
     k = edges.shape[1]
-    _fill(cells, edges.reshape(-1, 4), np.arange(0, len(quads) * k + 1, k), code, may_cover)
+    _fill(cells, edges.reshape(-1, 4), np.arange(0, len(quads) * k + 1, k), int(code), may_cover)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator,unused-ignore]

@@ -280,7 +280,7 @@ class _Path:
 def _meet(one: _Motion, other: _Motion) -> NDArrayBool:
     """(K,) whether two things come nearer than `CLEARANCE_M`; each is a row of discs."""
     reach = (sum(one.size_m) + sum(other.size_m)) / 2 + CLEARANCE_M
-    near = np.hypot(*(one.xy - other.xy).T) < reach
+    near: NDArrayBool = np.hypot(*(one.xy - other.xy).T) < reach
     result = near.copy()
     if near.any():
         a, ra = _discs(one, near)

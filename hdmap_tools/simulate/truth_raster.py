@@ -179,7 +179,8 @@ class TruthRaster:
         Raises:
             FormatError: If the tile cannot be read.
         """
-        return _remember(self._codes, (ix, iy), 16, self._read_codes)
+        codes: NDArrayByte = _remember(self._codes, (ix, iy), 16, self._read_codes)
+        return codes
 
     def labels_at(self, xy: NDArrayFloat) -> NDArrayByte:
         """(N,) uint8 label ids of ``paz2020`` at city points (N, 2 or 3); 255 outside."""

@@ -20,6 +20,10 @@ CAR_COLOURS: Final = (
 )
 
 
+MIRROR_M: Final = 0.17
+"""So far the mirrors of a car reach beyond its sides."""
+
+
 class _Station(NamedTuple):
     """A cross-section of a body at x: sill, beltline and roof heights, half widths at the last two."""
 
@@ -115,7 +119,7 @@ def car(rng: np.random.Generator) -> tuple[Mesh, tuple[float, float]]:
                 Mat.CAR_BODY_WHITE,
             )
         )
-        y = side * (half + 0.08)
+        y = side * (half + MIRROR_M - 0.09)
         x = next(s.x for s in stations[::-1] if s.roof - s.belt > 0.3) + 0.45
         parts.append(box((x - 0.06, y - 0.09, 0.95), (x + 0.06, y + 0.09, 1.1), colour))
     return Mesh.merged(parts), (length, 2 * half)
@@ -201,7 +205,8 @@ def _loft(stations: tuple[_Station, ...], body: Mat, glass: Mat, roof_is_body: b
                 (s.x, s.half_belt - 0.06, s.sill),
             ]
         )
-    faces, materials = [], []
+    faces: list[tuple[int, ...]] = []
+    materials: list[int] = []
     n = 6
     for k in range(len(stations) - 1):
         a, b = stations[k], stations[k + 1]
@@ -221,7 +226,7 @@ def _loft(stations: tuple[_Station, ...], body: Mat, glass: Mat, roof_is_body: b
         for j in range(1, n - 1):
             faces.append((base, base + j, base + j + 1)[::-flip])
             materials.append(int(body))
-    # Rings run from −y over the roof to +y as seen from behind: that is clockwise seen along x.
+    # Rings run from -y over the roof to +y as seen from behind: that is clockwise seen along x.
     return mesh_of(np.array(rings).reshape(-1, 3), np.array(faces), np.array(materials))
 
 
@@ -238,7 +243,7 @@ def _disc(x: float, y: float, radius: float, half_thick: float, mat: Mat, sides:
     low_cap = np.column_stack(
         [np.zeros(sides - 2, dtype=int), np.arange(2, sides), np.arange(1, sides - 1)]
     )
-    # z becomes −y, y becomes z: a quarter turn about x keeps the outside outside.
+    # z becomes -y, y becomes z: a quarter turn about x keeps the outside outside.
     turned = np.column_stack([v[:, 0] + x, -v[:, 2] + y, v[:, 1] + radius])
     return mesh_of(turned, np.concatenate([upright.triangles, low_cap]), int(mat))
 
