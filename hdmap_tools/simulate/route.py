@@ -208,8 +208,8 @@ def motion_along(
 ) -> tuple[NDArrayFloat, NDArrayFloat]:
     """When the vehicle is where: at most `speed_mps`, slower in bends, smoothly.
 
-    Lateral acceleration stays below 2 m/s², that along the route below 1.5 m/s² and
-    continuous. The drive begins and ends at the speed the road there allows.
+    Lateral acceleration stays below 2 m/s², that along the route below 1.5 m/s², changing in
+    steps of less than 0.2 m/s². The drive begins and ends at the speed the road there allows.
 
     Args:
         route: What it follows.
