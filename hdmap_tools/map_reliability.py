@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from hdmap_tools.compare.paper import PAINT_SHARE, true_classes
-from hdmap_tools.compare.reference import SHARE_TOLERANCE, load_reference
+from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.compare.reliability import (
     CellTruth,
     ReliabilityReport,
@@ -99,12 +99,11 @@ def load_truth(
     """
     if not path.is_dir():
         return truth_of_reference(load_reference(path, grid), classes)
+    from hdmap_tools.compare.truth_reference import true_shares
     from hdmap_tools.simulate.truth_raster import TruthRaster
 
     names = [str(c) for c in MAP_CLASSES]
-    raster = TruthRaster.open(path)
-    shares = raster.class_fractions(grid, MAP_CLASSES).astype(np.float64)
-    shares[:, raster.known_fraction(grid) < 1.0 - SHARE_TOLERANCE] = np.nan
+    shares = true_shares(TruthRaster.open(path), grid)
     if not np.isfinite(shares).any():
         raise FormatError(
             f"The truth raster {path} does not overlap the map; it belongs to another place."

@@ -160,7 +160,8 @@ def settled(config: Config, drive: Drive) -> Config:
         _LOG.info("Using the model %s.", model)
     reference = compare.reference
     if reference is None:
-        masks = [p for p in drive.reference_maps if p.suffix == ".png"]
+        # A vector map does not say where it ends; cells do.
+        masks = [p for p in drive.reference_maps if p.suffix == ".png" or p.is_dir()]
         if len(masks) == 1:
             reference = masks[0]
             _LOG.info("Comparing with %s, which lies with the drive.", reference)
@@ -187,9 +188,9 @@ def check_settings(config: Config, drive: Drive, segmenter: Segmenter) -> None:
     model_for(map_meta(config, drive, segmenter.label_set, segmenter.name, 1), config)
     choose(config.vectorize)
     reference = config.compare.reference
-    if reference is not None and not reference.is_file():
+    if reference is not None and not reference.exists():
         raise FormatError(
-            f"The reference {reference} does not exist; expected a mask PNG or a map."
+            f"The reference {reference} does not exist; expected a mask PNG, a map or a truth raster."
         )
 
 

@@ -99,11 +99,11 @@ def load_reference(
     classes: Sequence[MapClass] | None = None,
     assume_same_frame: bool = False,
 ) -> Reference:
-    """Read a mask picture or a vector map and sample it onto a grid.
+    """Read a mask picture, a vector map or a truth raster and sample it onto a grid.
 
     Args:
-        path: ``NAME.png`` with ``NAME.json`` beside it, or a vector map in any
-            format that the package reads.
+        path: ``NAME.png`` with ``NAME.json`` beside it, a vector map in any format
+            that the package reads, or the folder ``truth/raster`` of a simulated drive.
         grid: The map's grid.
         min_share: Share of a cell that must be marked for it to be truth; 0 means
             any part at all.
@@ -115,6 +115,10 @@ def load_reference(
         FormatError: If the file cannot be read, or does not overlap the grid.
         CRSMismatchError: If its place relative to the map cannot be known.
     """
+    if path.is_dir():
+        from hdmap_tools.compare.truth_reference import reference_from_truth_raster
+
+        return reference_from_truth_raster(path, grid)
     if path.suffix.lower() == ".png":
         return reference_from_mask(
             load_mask(path),

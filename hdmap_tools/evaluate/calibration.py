@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from hdmap_tools.compare.truth_reference import true_shares
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.grid import BevGrid
-from hdmap_tools.labels.label_set import MAP_CLASSES
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
@@ -48,8 +46,7 @@ class TruthOfDrive:
 
     def shares(self, grid: BevGrid) -> NDArrayFloat:
         """(class, y, x) share of each cell that each map class covers; NaN where nothing is known."""
-        raster = TruthRaster.open(self.folder / "raster")
-        return np.asarray(raster.class_fractions(grid, MAP_CLASSES), dtype=np.float64)
+        return true_shares(TruthRaster.open(self.folder / "raster"), grid)
 
 
 def confusion_of_drives(

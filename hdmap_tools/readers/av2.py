@@ -64,6 +64,8 @@ MAP_FRAME_FILE: Final = "map_frame.json"
 """Not part of the layout: where a simulated log's city frame lies on earth."""
 TRUE_MAP_FILE: Final = "truth/vector_map.gpkg"
 """Not part of the layout: the vector map that a simulated log drives through."""
+TRUE_CELLS_FOLDER: Final = "truth/raster"
+"""Not part of the layout: what each cell of the ground is."""
 
 CITY_UTM_ZONE_LAT_LON: Final[Mapping[str, tuple[int, float, float]]] = {
     "ATX": (14, 30.27464237939507, -97.7404457407424),
@@ -137,7 +139,9 @@ def read_av2(
     ]
     maps = tuple(sorted((log_dir / "map").glob("log_map_archive_*.json")))
     frame = _map_frame(log_dir, maps, warnings)
-    true_map = log_dir / TRUE_MAP_FILE
+    true_maps = tuple(
+        p for p in (log_dir / n for n in (TRUE_MAP_FILE, TRUE_CELLS_FOLDER)) if p.exists()
+    )
     for warning in warnings:
         logger.warning("%s: %s", log_dir.name, warning)
     return Drive(
@@ -155,7 +159,7 @@ def read_av2(
         sweeps=tuple(sweeps),
         # partial, not a closure: a drive can then be sent to another process.
         read_sweep=partial(read_av2_sweep, trajectory=None if is_compensated else trajectory),
-        reference_maps=(*maps, true_map) if true_map.is_file() else maps,
+        reference_maps=(*maps, *true_maps),
         warnings=tuple(warnings),
     )
 

@@ -173,6 +173,15 @@ class TruthRaster:
                 "simulate the drive again."
             ) from error
 
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """(x0, y0, x1, y1) of all tiles, city metres."""
+        tiles = np.array(sorted(self.tiles)).reshape(-1, 2)
+        if len(tiles) == 0:
+            return 0.0, 0.0, 0.0, 0.0
+        low, high = tiles.min(axis=0) * TILE_M, (tiles.max(axis=0) + 1) * TILE_M
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
     def codes(self, ix: int, iy: int) -> NDArrayByte:
         """(1280, 1280) material codes of a tile, row 0 the southernmost.
 
