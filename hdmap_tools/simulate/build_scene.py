@@ -13,6 +13,7 @@ from hdmap_tools.simulate.ground_mesh import base_mesh, far_mesh, raised_mesh
 from hdmap_tools.simulate.objects import RoadsideObjects
 from hdmap_tools.simulate.parked import parked_vehicles
 from hdmap_tools.simulate.road_area import WorldIndex
+from hdmap_tools.simulate.road_crown import RoadCrown
 from hdmap_tools.simulate.route import Route
 from hdmap_tools.simulate.scene import Actor, Mesh, Scene
 from hdmap_tools.simulate.settings import SimulationSettings
@@ -47,8 +48,8 @@ class SceneBuilder:
     ) -> None:
         self.world = world
         self.settings = settings
-        self.terrain = terrain or Terrain(settings.seed)
         self.index = WorldIndex(world)
+        self.terrain = terrain or Terrain(settings.seed, crown=RoadCrown(self.index))
         self.tiles = SurfaceTiles(self.index, settings)
         self.objects = RoadsideObjects(self.index, self.terrain, settings)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -33,7 +34,7 @@ def base_mesh(tiles: set[tuple[int, int]], terrain: Terrain, origin: NDArrayFloa
     for ix, iy in tiles:
         wanted[iy - y0, ix - x0] = True
     wanted = np.repeat(np.repeat(wanted, _PER_TILE, axis=0), _PER_TILE, axis=1)
-    return _grid_mesh(x, y, wanted, terrain, origin, 0.0)
+    return _grid_mesh(x, y, wanted, terrain.height_at, origin, 0.0)
 
 
 def far_mesh(
@@ -47,7 +48,9 @@ def far_mesh(
     step = 5.12
     x0, y0, x1, y1 = (round(b / step) for b in bounds_m)
     x, y = np.meshgrid(np.arange(x0, x1 + 1) * step, np.arange(y0, y1 + 1) * step)
-    mesh = _grid_mesh(x, y, np.ones((y1 - y0, x1 - x0), dtype=np.bool_), terrain, origin, -0.12)
+    mesh = _grid_mesh(
+        x, y, np.ones((y1 - y0, x1 - x0), dtype=np.bool_), terrain.bare_height_at, origin, -0.12
+    )
     centres = mesh.vertices[mesh.triangles].mean(axis=1)[:, :2] + origin[:2]
     materials = np.where(
         shapely.intersects_xy(is_road, centres), np.uint8(Mat.ASPHALT), np.uint8(Mat.GRASS)
@@ -59,12 +62,12 @@ def _grid_mesh(
     x: NDArrayFloat,
     y: NDArrayFloat,
     wanted: NDArrayBool,
-    terrain: Terrain,
+    height_at: Callable[[NDArrayFloat], NDArrayFloat],
     origin: NDArrayFloat,
     lift_m: float,
 ) -> Mesh:
     xy = np.column_stack([x.ravel(), y.ravel()])
-    vertices = np.column_stack([xy, terrain.height_at(xy) + lift_m]) - origin
+    vertices = np.column_stack([xy, height_at(xy) + lift_m]) - origin
     rows, cols = np.nonzero(wanted)
     a = rows * x.shape[1] + cols
     b, c, d = a + 1, a + x.shape[1] + 1, a + x.shape[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -25,12 +26,20 @@ class Terrain:
 
     Attributes:
         seed: Everything follows from it.
-        is_flat: Whether the height is 0 everywhere.
+        is_flat: Whether the bare height is 0 everywhere.
+        crown: What the road adds at city points (N, 2), `RoadCrown` of the world; None for
+            a road as level across as the land.
     """
 
-    def __init__(self, seed: int, is_flat: bool = False) -> None:
+    def __init__(
+        self,
+        seed: int,
+        is_flat: bool = False,
+        crown: Callable[[NDArrayFloat], NDArrayFloat] | None = None,
+    ) -> None:
         self.seed = seed
         self.is_flat = is_flat
+        self.crown = crown
         rng = rng_at(seed, Purpose.TERRAIN)
         vectors, amplitudes, phases = [], [], []
         for count, shortest_m, longest_m, slope in _BANDS:
@@ -48,6 +57,13 @@ class Terrain:
 
     def height_at(self, xy: NDArrayFloat) -> NDArrayFloat:
         """(N,) metres of the road surface at city points (N, 2)."""
+        height = self.bare_height_at(xy)
+        if self.crown is not None:
+            height += self.crown(np.asarray(xy, dtype=np.float64))
+        return height
+
+    def bare_height_at(self, xy: NDArrayFloat) -> NDArrayFloat:
+        """(N,) metres of the land without the crown of the road."""
         xy = np.asarray(xy, dtype=np.float64)
         height = np.zeros(len(xy))
         if self.is_flat:
@@ -59,7 +75,7 @@ class Terrain:
         return height
 
     def gradient_at(self, xy: NDArrayFloat) -> NDArrayFloat:
-        """(N, 2) slope of the ground east and north, metres a metre."""
+        """(N, 2) slope of the land east and north, metres a metre; without the crown."""
         xy = np.asarray(xy, dtype=np.float64)
         gradient = np.zeros((len(xy), 2))
         if self.is_flat:

@@ -15,6 +15,7 @@ from hdmap_tools.geometry.polyline import arc_lengths, drop_repeats, resample
 from hdmap_tools.simulate import vehicles
 from hdmap_tools.simulate.location_noise import Purpose, rng_at
 from hdmap_tools.simulate.road_area import WorldIndex, block_of
+from hdmap_tools.simulate.road_crown import RoadCrown
 from hdmap_tools.simulate.route import Route
 from hdmap_tools.simulate.scene import Actor, Mesh
 from hdmap_tools.simulate.settings import Difficulty, SimulationSettings
@@ -66,11 +67,11 @@ def build_actors(
         ego_times_s: (K,) rising seconds of the drive.
         ego_arc_m: (K,) how far along the route it is at these times.
         settings: Seed and difficulty decide who and how many.
-        terrain: The ground; by default that of the seed.
+        terrain: The ground; by default that of the seed, with the road's crown.
         index: Of the world, where there is one already.
     """
     index = index or WorldIndex(world)
-    terrain = terrain or Terrain(settings.seed)
+    terrain = terrain or Terrain(settings.seed, crown=RoadCrown(index))
     last = float(ego_times_s[-1])
     times = np.arange(float(ego_times_s[0]), last + STEP_S, STEP_S)
     arc = np.interp(times, ego_times_s, ego_arc_m)

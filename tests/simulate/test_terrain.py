@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
 
+from hdmap_tools.simulate.road_area import WorldIndex
+from hdmap_tools.simulate.road_crown import RoadCrown
 from hdmap_tools.simulate.terrain import Terrain
+from tests.simulate.small_worlds import bend, curved_street
 
 SEEDS = range(20)
 
@@ -48,3 +51,20 @@ def test_flat_ground_is_flat() -> None:
     xy = np.random.default_rng(0).uniform(-100, 100, (50, 2))
     assert not Terrain(3, is_flat=True).height_at(xy).any()
     assert not Terrain(3, is_flat=True).gradient_at(xy).any()
+
+
+def test_the_road_is_crowned_and_the_land_beside_it_is_not() -> None:
+    crown = RoadCrown(WorldIndex(curved_street()))
+    s = np.arange(60.0, 120.0, 0.5)
+    profile = [crown(bend(s, left)).mean() for left in (-3.4, -2.0, 0.0, 2.0, 3.4)]
+    # Two metres in from the edge at 2 %, a little rounded; highest in the middle, and even.
+    assert 0.02 < profile[1] < 0.04
+    assert profile[0] < profile[1] < profile[2] < 0.07
+    np.testing.assert_allclose(profile, profile[::-1], atol=0.002)
+    assert not crown(bend(s, 6.0)).any()
+    steps = np.abs(np.diff(crown(bend(np.full(800, 90.0), np.linspace(-8, 8, 800)))))
+    assert steps.max() < 0.05 * 16 / 800  # no step anywhere, no slope above 5 %
+    bare, crowned = Terrain(3), Terrain(3, crown=crown)
+    xy = bend(s, 1.0)
+    np.testing.assert_allclose(crowned.height_at(xy), bare.height_at(xy) + crown(xy))
+    np.testing.assert_array_equal(crowned.bare_height_at(xy), bare.height_at(xy))
