@@ -115,7 +115,7 @@ def load_reference(
         FormatError: If the file cannot be read, or does not overlap the grid.
         CRSMismatchError: If its place relative to the map cannot be known.
     """
-    if path.is_dir():
+    if path.is_dir() and (path / "index.json").is_file():
         from hdmap_tools.compare.truth_reference import reference_from_truth_raster
 
         return reference_from_truth_raster(path, grid)

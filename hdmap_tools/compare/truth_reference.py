@@ -48,7 +48,7 @@ def reference_from_truth_raster(
     source = f"truth of {folder.absolute().parent.parent.name}"
     frame_relation(raster.frame, grid.frame, source)
     shares = true_shares(raster, grid)
-    covered = np.isfinite(shares).all(axis=0)
+    covered = np.asarray(np.isfinite(shares).all(axis=0))
     if not covered.any():
         raise FormatError(str(no_overlap(source, raster.bounds_m, grid)))
     index = true_classes(shares, [str(c) for c in MAP_CLASSES], paint_share)
