@@ -19,3 +19,22 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no recorded sample data at {root}; set HDMAP_DATA to its folder")
     return root
+
+
+@pytest.fixture(scope="session")
+def simulated_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short simulated drive with truth and exact poses: 3 images, 20 sweeps. Read only."""
+    from hdmap_tools.simulate.drive import simulate_drive
+    from hdmap_tools.simulate.read_world import shipped_world
+    from hdmap_tools.simulate.settings import LidarPreset, SimulationSettings
+
+    settings = SimulationSettings(
+        seed=3,
+        length_m=16,
+        camera_hz=1.6,
+        image_width_px=480,
+        image_height_px=300,
+        lidar=LidarPreset.VLP16,
+    )
+    out = tmp_path_factory.mktemp("simulated") / "drive"
+    return simulate_drive(shipped_world(), out, settings)

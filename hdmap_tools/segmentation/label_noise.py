@@ -38,10 +38,10 @@ _MAX_RANGE_M: Final = 50.0
 _NEAR: Final = 0.4
 _REFERENCE_WIDTH_PX: Final = 960
 _TEXTURE_CELLS: Final = 1024
-_IMAGE_SCALES: Final = ((1.5, 0.3), (5.0, 0.4), (16.0, 0.3))
+_IMAGE_SCALES: Final = ((2.5, 0.1), (7.0, 0.4), (20.0, 0.5))
 """Blur in pixels of an image 960 wide, and share of the variance of what is in the image."""
-_GROUND_CELL_M: Final = 0.2
-_GROUND_BLUR_CELLS: Final = 3.0
+_GROUND_CELL_M: Final = 0.1
+_GROUND_BLUR_CELLS: Final = 5.0
 _BESIDE_PX, _AROUND_PX = 3, 12
 _FIT_ROUNDS: Final = 12
 
@@ -107,11 +107,13 @@ class NoiseFields:
     Args:
         seed: Everything follows from it.
         width_px: Of the images; textures are as coarse as they are wide.
+        height_px: Of the images.
     """
 
-    def __init__(self, seed: int, width_px: int) -> None:
+    def __init__(self, seed: int, width_px: int, height_px: int) -> None:
         self._seed = seed
         self._scale = width_px / _REFERENCE_WIDTH_PX
+        self._margins = ((0, height_px), (0, width_px))
 
     def draw(self, key: str, ground: ViewedGround, city_SE3_ego: SE3) -> list[NDArrayFloat32]:
         """Two independent fields (H, W) float32 of one image.
@@ -158,7 +160,7 @@ class NoiseFields:
     @cached_property
     def _image_textures(self) -> list[NDArrayFloat32]:
         return [
-            _texture(self._seed, number, blur * self._scale)
+            np.pad(_texture(self._seed, number, blur * self._scale), self._margins, mode="wrap")
             for number, (blur, _) in enumerate(_IMAGE_SCALES)
         ]
 
@@ -257,19 +259,17 @@ def _texture(seed: int, number: int, blur_cells: float) -> NDArrayFloat32:
 
 
 def _cut(texture: NDArrayFloat32, shape: tuple[int, ...], rng: np.random.Generator) -> NDArrayAny:
-    """A piece of a texture, somewhere, turned over or not."""
-    row, column, turns = (int(n) for n in rng.integers((*texture.shape, 8)))
-    rows = (row + np.arange(shape[0])) % len(texture)
-    columns = (column + np.arange(shape[1])) % len(texture)
-    if turns & 1:
-        rows = rows[::-1]
-    if turns & 2:
-        columns = columns[::-1]
-    source = texture.T if turns & 4 else texture
-    return source[rows[:, None], columns[None, :]]
+    """A piece of a texture that goes on for `shape` beyond its period, turned over or not."""
+    row, column, turns = (int(n) for n in rng.integers((_TEXTURE_CELLS, _TEXTURE_CELLS, 4)))
+    piece = texture[row : row + shape[0], column : column + shape[1]]
+    return piece[:: -1 if turns & 1 else 1, :: -1 if turns & 2 else 1]
 
 
 def _sampled(texture: NDArrayFloat32, place: Sequence[NDArrayFloat32]) -> NDArrayAny:
-    """Nearest texels at cell positions x and y: interpolation would make the values less spread."""
-    x, y = (np.floor(p).astype(np.int32) & (_TEXTURE_CELLS - 1) for p in place)
-    return texture[y, x]
+    """Values at cell positions x and y; so blurred a texture loses no spread between its cells."""
+    import cv2
+
+    # np.mod does the same in six times the time.
+    period = np.float32(_TEXTURE_CELLS)
+    x, y = (p - period * np.floor(p / period) for p in place)
+    return cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)

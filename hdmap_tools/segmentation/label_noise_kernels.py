@@ -9,9 +9,9 @@ from numba import njit
 
 from hdmap_tools.types import NDArrayByte, NDArrayFloat, NDArrayFloat32
 
-EVERYWHERE = 0.25
+EVERYWHERE = 0.1
 BESIDE = 1.0
-AROUND = 0.25
+AROUND = 0.3
 """Weights of a wrong label: anywhere, where the true label beside it is that one, and further around."""
 
 
@@ -88,11 +88,16 @@ def confused(
     """
     drawn = true.copy()
     likely = np.zeros(scale.shape[1])
+    # Most pixels are so far from an error that what lies around them need not be asked.
+    most_likely = scale.sum(axis=1) * (EVERYWHERE + BESIDE + AROUND)
     for i in range(len(true)):
         if true[i] >= scale.shape[0]:
             continue
+        chance = _uniform(whether[i])
+        if chance >= most_likely[true[i]] * reach[i]:
+            continue
         total = _total(true[i], reach[i], beside[i], around[i], scale, likely)
-        if _uniform(whether[i]) >= total:
+        if chance >= total:
             continue
         left = _uniform(which[i]) * total
         for label in range(scale.shape[1]):

@@ -84,7 +84,7 @@ class SimulatedSegmenter:
         self._lock = threading.Lock()
         self._scale: NDArrayFloat | None = None
         self._ground: dict[str, ViewedGround] = {}
-        self._fields: dict[int, NoiseFields] = {}
+        self._fields: dict[tuple[int, int], NoiseFields] = {}
         self._fingerprint: str | None = None
 
     @property
@@ -124,9 +124,7 @@ class SimulatedSegmenter:
         with self._lock:
             scale = self._fitted()
             ground = self._ground_of(camera)
-            fields = self._fields.setdefault(
-                camera.width_px, NoiseFields(self._seed, camera.width_px)
-            )
+            fields = self._fields_for(camera)
         rotations, translations = self._trajectory.interpolate_many(np.array([image.timestamp_ns]))
         pose = SE3(rotations[0], translations[0])
         whether, which = fields.draw(image.key, ground, pose)
@@ -147,6 +145,12 @@ class SimulatedSegmenter:
         if camera.name not in self._ground:
             self._ground[camera.name] = ViewedGround.of_camera(camera)
         return self._ground[camera.name]
+
+    def _fields_for(self, camera: PinholeCamera) -> NoiseFields:
+        size_px = (camera.width_px, camera.height_px)
+        if size_px not in self._fields:
+            self._fields[size_px] = NoiseFields(self._seed, *size_px)
+        return self._fields[size_px]
 
     def _fitted(self) -> NDArrayFloat:
         """The scale of the noise, fitted on images spread over the whole drive."""
