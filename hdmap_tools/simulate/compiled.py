@@ -55,3 +55,8 @@ def in_bands(kernel: Callable[[int, int], None], count: int) -> None:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="simulate")
+
+
+# The threads of a pool are not there in a forked process; it makes its own.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -287,6 +287,10 @@ def shade(
         amplitude = float(texture[code])
         if on_ground[i]:
             flat = sqrt(dx * dx + dy * dy) + 1e-9
+            if across_m < 0.015:
+                # Edges of paint are ragged; those of the raster are stairs.
+                x += 0.006 * noise2(cx * 30.0, cy * 30.0, seed + 30)
+                y += 0.006 * noise2(cx * 30.0, cy * 30.0, seed + 31)
             red, green, blue = _ground_albedo(
                 x,
                 y,
