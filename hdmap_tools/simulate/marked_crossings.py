@@ -37,11 +37,12 @@ def crossings_between(
         Convex polygons, sorted by their place.
     """
     pairs = []
-    for i, a in enumerate(lines):
-        for j in range(i + 1, len(lines)):
-            apart_m = _distance_side_by_side(a, lines[j])
-            if apart_m is not None:
-                pairs.append((apart_m, i, j))
+    shapes = np.array([shapely.LineString(line) for line in lines], dtype=object)
+    near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=MAX_APART_M)
+    for i, j in near.T.tolist():
+        apart_m = _distance_side_by_side(lines[i], lines[j]) if i < j else None
+        if apart_m is not None:
+            pairs.append((apart_m, i, j))
     used: set[int] = set()
     found: list[shapely.Polygon] = []
     for _, i, j in sorted(pairs):

@@ -137,25 +137,27 @@ def _reach(graph: RoadGraph, length_m: float) -> dict[str, float]:
     """The longest drive from the begin of each lane, lanes driven again allowed, up to a limit.
 
     The limit is somewhat above `length_m`, so that a drive that goes on beats one that ends.
+    Lanes from which one comes back to where one was have no other limit.
     """
+    import networkx
+
     limit = length_m + 50.0
-    reach = dict(graph.length_m)
-    waiting = set(reach)
-    before: dict[str, list[str]] = {}
-    for k, ways in graph.successors.items():
-        for other in ways:
-            before.setdefault(other, []).append(k)
-    while waiting:
-        k = waiting.pop()
-        for earlier in before.get(k, ()):
-            longer = min(graph.length_m[earlier] + reach[k], limit)
-            if longer > reach[earlier] + 1e-6:
-                reach[earlier] = longer
-                waiting.add(earlier)
-        for beside in graph.changes[k]:
-            if reach[k] > reach[beside] + 1e-6:
-                reach[beside] = reach[k]
-                waiting.add(beside)
+    ways = networkx.DiGraph()
+    ways.add_nodes_from(graph.length_m)
+    for k in graph.length_m:
+        ways.add_edges_from((k, other) for other in (*graph.successors[k], *graph.changes[k]))
+    reach: dict[str, float] = {}
+    # Components come after those that they lead into.
+    for component in networkx.strongly_connected_components(ways):
+        is_loop = any(s in component for k in component for s in graph.successors[k])
+        # Else they are neighbours, and one can change to the one that leads on.
+        found = max(
+            graph.length_m[k] + max((reach[s] for s in graph.successors[k]), default=0.0)
+            if not is_loop
+            else limit
+            for k in component
+        )
+        reach |= dict.fromkeys(component, min(found, limit))
     return reach
 
 

@@ -15,6 +15,7 @@ from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import MarkStyle
 from hdmap_tools.simulate.read_world import read_world, shipped_world
 from hdmap_tools.simulate.route import Route, motion_along, places_along, plan_route
+from hdmap_tools.simulate.route_search import RoadGraph, _reach
 from hdmap_tools.simulate.smooth_line import between, curvature, smoothed
 from hdmap_tools.simulate.world_map import LineKind, Paint, WorldLane, WorldLine, WorldMap
 
@@ -152,6 +153,15 @@ def test_a_neighbour_that_comes_the_other_way_is_no_lane_to_change_to() -> None:
     assert plan_route(world, 150.0, "there", 0).lane_ids == ("there",)
 
 
+def test_a_drive_of_a_thousand_kilometres_is_planned_in_reasonable_time() -> None:
+    """Looking ahead does not drive every lap."""
+    ring = lane("ring", arc(0, 0, 0.0, 20.0, 2.0 * np.pi), "ring", "way")
+    world = world_of(ring, lane("way", straight(0, 0, 50, 0)))
+    reach = _reach(RoadGraph.of_world(world), 1e6)
+    assert reach["ring"] >= 1e6
+    assert reach["way"] == pytest.approx(50.0)
+
+
 def test_the_same_seed_drives_the_same_way() -> None:
     world = read_world(shipped_world())
     routes = [plan_route(world, 400.0, None, seed) for seed in (5, 5, 6, 7, 8)]
@@ -220,7 +230,7 @@ def test_kinks_between_lanes_are_rounded(turn_deg: float, length_m: float) -> No
     line = smoothed(middle, np.full(len(middle), HALF_M), 0.25)
     # A circle of this radius has room; curvature that rises and falls peaks at twice its mean.
     room_m = (HALF_M - 0.4) / max(1.0 / np.cos(turn / 2.0) - 1.0, 1e-9)
-    assert 1.0 / np.abs(curvature(line)).max() >= min(5.0, room_m / 2.0)
+    assert np.abs(curvature(line)).max() <= 1.0 / min(5.0, room_m / 2.0)
     away = shapely.distance(shapely.LineString(middle), shapely.points(line))
     assert away.max() <= HALF_M - 0.3
     np.testing.assert_allclose(line[[0, -1]], middle[[0, -1]], atol=1e-2)
