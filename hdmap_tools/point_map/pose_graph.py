@@ -76,15 +76,36 @@ class Prior:
             zero at a drive's end.
         memory: (S, 6) share of a pose's error that the next one of its drive keeps.
         sigma: (S, 6) of what the next one adds; both mean nothing at a drive's end.
+        offset_of: (S,) which offset each pose shares with its whole drive, or -1.
+        offset_information: (D, 6) of each offset; the mean of a drive's chain is its offset.
     """
 
     own: NDArrayFloat
     next: NDArrayFloat
     memory: NDArrayFloat
     sigma: NDArrayFloat
+    offset_of: NDArrayInt
+    offset_information: NDArrayFloat
 
-    def times(self, vectors: NDArrayFloat) -> NDArrayFloat:
-        """Precision times corrections (S, 6)."""
+    def pull(self, vectors: NDArrayFloat) -> NDArrayFloat:
+        """Gradient (S, 6) at corrections (S, 6), the offsets being the best for them."""
+        rows, bindings, totals = self.bindings
+        best = np.zeros_like(totals)
+        np.add.at(best, self.offset_of[rows], bindings * vectors[rows])
+        about = vectors.copy()
+        about[rows] -= (best / totals)[self.offset_of[rows]]
+        return self._times(about)
+
+    @property
+    def bindings(self) -> tuple[NDArrayInt, NDArrayFloat, NDArrayFloat]:
+        """Poses (R,) that share an offset, their precision bound to it (R, 6), and its own (D, 6)."""
+        rows = np.flatnonzero(self.offset_of >= 0)
+        bound = self._times(np.ones_like(self.own))[rows]
+        totals = self.offset_information.copy()
+        np.add.at(totals, self.offset_of[rows], bound)
+        return rows, bound, totals
+
+    def _times(self, vectors: NDArrayFloat) -> NDArrayFloat:
         result: NDArrayFloat = self.own * vectors
         result[:-1] += self.next[:-1] * vectors[1:]
         result[1:] += self.next[:-1] * vectors[:-1]
@@ -122,9 +143,6 @@ def drive_prior(
     forgotten = -np.expm1(-seconds / config.noise_correlation_s)
     change = 2 * noise**2 * forgotten[:, None] + drift**2 * metres[:, None] / 100.0
     spread = noise**2 + drift**2 * max(trajectory.length_m, 100.0) / 100.0
-    if not is_reference:
-        between = (config.between_drives_m, np.deg2rad(config.between_drives_deg))
-        spread = spread + np.repeat(between, 3) ** 2
     memory = np.zeros((len(trajectory), 6))
     memory[:-1] = np.clip(1 - change / (2 * spread), 0.0, 1 - 1e-9)
     innovation = 1 / (spread * (1 - memory[:-1] ** 2))
@@ -134,7 +152,15 @@ def drive_prior(
     own[:-1] += memory[:-1] ** 2 * innovation
     after = np.zeros_like(memory)
     after[:-1] = -memory[:-1] * innovation
-    return Prior(own, after, memory, np.sqrt(spread * (1 - memory**2)))
+    between = np.repeat([config.between_drives_m, np.deg2rad(config.between_drives_deg)], 3)
+    return Prior(
+        own,
+        after,
+        memory,
+        np.sqrt(spread * (1 - memory**2)),
+        offset_of=np.full(len(trajectory), -1 if is_reference else 0),
+        offset_information=np.zeros((0, 6)) if is_reference else between[None] ** -2.0,
+    )
 
 
 def observed_scale(
@@ -167,11 +193,19 @@ def observed_scale(
 
 def joined_priors(priors: list[Prior]) -> Prior:
     """Of several drives, one after another."""
+    firsts = np.cumsum([0] + [len(prior.offset_information) for prior in priors])
     return Prior(
         np.concatenate([prior.own for prior in priors]),
         np.concatenate([prior.next for prior in priors]),
         np.concatenate([prior.memory for prior in priors]),
         np.concatenate([prior.sigma for prior in priors]),
+        offset_of=np.concatenate(
+            [
+                np.where(prior.offset_of >= 0, prior.offset_of + first, -1)
+                for prior, first in zip(priors, firsts[:-1], strict=True)
+            ]
+        ),
+        offset_information=np.concatenate([prior.offset_information for prior in priors]),
     )
 
 
@@ -206,16 +240,25 @@ def solve(
 
     count = len(gradient)
     registered = _symmetric(rows, columns, blocks, count)
-    beside = prior.next.ravel()[:-6]
-    given = diags([prior.own.ravel(), beside, beside], [0, 6, -6], format="csc")
-    pull = prior.times(current.vectors).ravel()
+    given, binding, offsets = _prior_matrices(prior)
+    pull = prior.pull(current.vectors).ravel()
+    # The offsets begin at their best for the current corrections: nothing pulls on them.
+    rest = np.zeros(offsets.shape[0])
     if ties is None:
-        matrix, right = given + registered, pull + gradient.ravel()
+        blocks_of = [[given + registered, binding], [binding.T, offsets]]
+        right = np.concatenate([pull + gradient.ravel(), rest])
     else:
         numbers = np.arange(count)
         tie = _symmetric(numbers, numbers, ties, count)
-        matrix = block_array([[given + tie, -tie], [-tie, registered + tie]], format="csc")
-        right = np.concatenate([pull, gradient.ravel()])
+        blocks_of = [
+            [given + tie, -tie, binding],
+            [-tie, registered + tie, None],
+            [binding.T, None, offsets],
+        ]
+        right = np.concatenate([pull, gradient.ravel(), rest])
+    if len(rest) == 0:
+        blocks_of = [row[:-1] for row in blocks_of[:-1]]
+    matrix = block_array(blocks_of, format="csc")
     # Metres and radians in one scale, so that pivots on the diagonal are sound.
     scale = 1 / np.sqrt(matrix.diagonal())
     scaling = diags([scale], [0], format="csc")
@@ -227,6 +270,27 @@ def solve(
     )
     step: NDArrayFloat = -(scale * factor.solve(scale * right))
     return step[: 6 * count].reshape(-1, 6)
+
+
+def _prior_matrices(prior: Prior) -> tuple[Any, Any, Any]:
+    """Precision of the corrections (6 S, 6 S), with their offsets (6 S, 6 D), of those (6 D, 6 D)."""
+    from scipy.sparse import coo_matrix, diags
+
+    beside = prior.next.ravel()[:-6]
+    own = diags([prior.own.ravel(), beside, beside], [0, 6, -6], format="csc")
+    rows, bound, totals = prior.bindings
+    inside = np.arange(6)
+    binding = coo_matrix(
+        (
+            -bound.ravel(),
+            (
+                (6 * rows[:, None] + inside).ravel(),
+                (6 * prior.offset_of[rows][:, None] + inside).ravel(),
+            ),
+        ),
+        shape=(prior.own.size, totals.size),
+    )
+    return own, binding.tocsc(), diags([totals.ravel()], [0], format="csc")
 
 
 def _symmetric(rows: NDArrayInt, columns: NDArrayInt, blocks: NDArrayFloat, count: int) -> Any:
