@@ -20,7 +20,7 @@ from hdmap_tools.labels.label_set import IGNORE_ID, MAP_CLASSES, MapClass, load_
 from hdmap_tools.simulate.materials import Mat
 from hdmap_tools.simulate.scene import label_ids_by_material
 from hdmap_tools.simulate.surface import CELL_M, TILE_CELLS, TILE_M, block_of_tile
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
+from hdmap_tools.types import NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
 if TYPE_CHECKING:
     from hdmap_tools.simulate.build_scene import SceneBuilder
@@ -238,21 +238,23 @@ class TruthRaster:
         Raises:
             MapMismatchError: If the resolution is none, or the frame another one.
         """
-        tables = np.zeros((len(classes), 256), dtype=np.bool_)
+        kinds = np.full(256, 255, dtype=np.uint8)
         for k, map_class in enumerate(classes):
             ids = self.label_set.ids_of_class(MapClass(map_class))
-            tables[k, 1:] = np.isin(self._label_ids[1:], ids)
-        return self._share(grid, tables)
+            kinds[1:][np.isin(self._label_ids[1:], ids)] = k
+        return self._share(grid, kinds, len(classes))
 
     def known_fraction(self, grid: BevGrid) -> NDArrayFloat32:
         """(y, x) float32 share of each cell of a grid that the truth covers."""
-        table = np.ones((1, 256), dtype=np.bool_)
-        table[0, 0] = False
-        share: NDArrayFloat32 = self._share(grid, table)[0]
+        kinds = np.zeros(256, dtype=np.uint8)
+        kinds[0] = 255
+        share: NDArrayFloat32 = self._share(grid, kinds, 1)[0]
         return share
 
-    def _share(self, grid: BevGrid, tables: NDArrayAny) -> NDArrayFloat32:
-        """Block sums of the cells for which a table says yes, tile by tile."""
+    def _share(self, grid: BevGrid, kinds: NDArrayByte, count: int) -> NDArrayFloat32:
+        """Share of cells of each kind in each cell of a grid, counted tile by tile."""
+        from hdmap_tools.simulate.truth_kernels import count_into
+
         n = round(grid.resolution_m / CELL_M)
         if n < 1 or abs(n * CELL_M - grid.resolution_m) > 1e-9:
             raise MapMismatchError(
@@ -260,7 +262,7 @@ class TruthRaster:
                 f"that; found {grid.resolution_m} m."
             )
         self.frame.require_same(grid.frame)
-        counts = np.zeros((len(tables), *grid.shape), dtype=np.int32)
+        counts = np.zeros((count, *grid.shape), dtype=np.int32)
         for ix, iy in sorted(self.tiles):
             x0, x1 = _cells_in_tile(ix, grid.x_min, grid.x_max, n)
             y0, y1 = _cells_in_tile(iy, grid.y_min, grid.y_max, n)
@@ -270,19 +272,7 @@ class TruthRaster:
                 y0 - iy * TILE_CELLS : y1 - iy * TILE_CELLS,
                 x0 - ix * TILE_CELLS : x1 - ix * TILE_CELLS,
             ]
-            rows, row_starts = _groups(y0, y1, n)
-            cols, col_starts = _groups(x0, x1, n)
-            for k, table in enumerate(tables):
-                chosen = table[codes]
-                if not chosen.any():
-                    continue
-                summed = np.add.reduceat(chosen.astype(np.int32), col_starts, axis=1)
-                summed = np.add.reduceat(summed, row_starts, axis=0)
-                counts[
-                    k,
-                    rows - grid.y_min : rows - grid.y_min + len(row_starts),
-                    cols - grid.x_min : cols - grid.x_min + len(col_starts),
-                ] += summed
+            count_into(counts, codes, kinds, y0 - grid.y_min * n, x0 - grid.x_min * n, n)
         share: NDArrayFloat32 = (counts / np.float32(n * n)).astype(np.float32)
         return share
 
@@ -346,10 +336,3 @@ def _remember(
 def _cells_in_tile(tile: int, low: int, high: int, n: int) -> tuple[int, int]:
     """2 cm cells along one axis that lie both in a tile and in a grid's cells low..high."""
     return max(tile * TILE_CELLS, low * n), min((tile + 1) * TILE_CELLS, high * n)
-
-
-def _groups(first: int, last: int, n: int) -> tuple[int, NDArrayInt]:
-    """First grid cell, and where the 2 cm cells first..last of each grid cell begin."""
-    cell = first // n
-    starts = np.arange(cell, -(-last // n)) * n - first
-    return cell, np.maximum(starts, 0)
