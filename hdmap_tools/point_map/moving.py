@@ -184,15 +184,15 @@ def estimate_lidar_position(sweeps: list[Sweep]) -> NDArrayFloat:
     usual = np.array([0.0, 0.0, 1.8])
     at, ring = np.concatenate(points), np.concatenate(rings)
     _, ring = np.unique(ring, return_inverse=True)
-    number = np.bincount(ring)
-    if len(number) < 4 * len(sweeps):
+    of_ring = np.bincount(ring)
+    if len(of_ring) < 4 * len(sweeps):
         return usual
 
     def spread(position: NDArrayFloat) -> NDArrayFloat:
         from_lidar = at - position
         flat = np.hypot(from_lidar[:, 0], from_lidar[:, 1])
         elevation = np.arctan2(from_lidar[:, 2], np.maximum(flat, 1e-6))
-        return np.asarray(elevation - (np.bincount(ring, elevation) / number)[ring])
+        return np.asarray(elevation - (np.bincount(ring, elevation) / of_ring)[ring])
 
     fit = least_squares(spread, usual, loss="soft_l1", f_scale=0.002, max_nfev=60)
     low, high = np.array([-3.0, -1.5, 0.5]), np.array([5.0, 1.5, 4.5])

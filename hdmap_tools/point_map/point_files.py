@@ -32,7 +32,7 @@ class PointCloud:
     Attributes:
         points: (N, 3) float64, finite; metres of `crs`, or of a frame that the file does not tell.
         intensity: (N,) uint8, None where the file has none.
-        is_ground: (N,) where the file classifies points (LAS class 2), else None.
+        is_ground: (N,) where the file classifies any point so (LAS class 2), else None.
         crs: Of a georeferenced LAS file, a `pyproj.CRS`; None if it has none.
         num_dropped: Points with NaN or infinite coordinates.
     """
@@ -90,7 +90,7 @@ def read_point_file(path: Path) -> PointCloud:
     if suffix not in SUFFIXES:
         raise PointMapError(f"{path}: expected a point cloud {', '.join(SUFFIXES)}.")
     cloud = _read_las(path) if suffix in LAS_SUFFIXES else _read_open3d(path)
-    finite = np.isfinite(cloud.points).all(axis=1)
+    finite: NDArrayBool = np.asarray(np.isfinite(cloud.points).all(axis=1))
     if finite.sum() < _FEWEST:
         raise PointMapError(
             f"{path} has {len(finite)} points, {int(finite.sum())} of them finite; expected a point cloud of "
@@ -198,7 +198,7 @@ def _read_open3d(path: Path) -> PointCloud:
     return PointCloud(
         points,
         None if intensity is None else _to_byte(intensity),
-        None if ground is None else ground > 0.5,
+        None if ground is None or not ground.any() else ground > 0.5,
     )
 
 
