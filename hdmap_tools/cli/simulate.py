@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from hdmap_tools.cli import options
+from hdmap_tools.cli.simulation import SimulationProgressBars, settings_of, world_path
 
 if TYPE_CHECKING:
-    from hdmap_tools.simulate.drive import SimulationProgress
+    from hdmap_tools.simulate.settings import SimulationSettings
 
 
-class _ImageSize(click.ParamType):
+class _ImageSize(click.ParamType):  # type: ignore[type-arg,unused-ignore]
     name = "WxH"
 
     def convert(
@@ -86,13 +86,9 @@ def command(ctx: click.Context, /, **given: Any) -> None:
         origin = (lat, lon, alt)
     from hdmap_tools.readers.av2 import read_av2
     from hdmap_tools.simulate.drive import simulate_drive
-    from hdmap_tools.simulate.read_world import shipped_world, shipped_worlds
 
-    world: Path = given["world"]
-    # A file of that name in the working folder is what the person sees, so it wins.
-    if not world.exists() and str(world) in shipped_worlds():
-        world = shipped_world(str(world))
-    with _Progress(ctx.obj["progress"]) as told:
+    world = world_path(given["world"])
+    with SimulationProgressBars(ctx.obj["progress"]) as told:
         out = simulate_drive(
             world,
             given["out"],
@@ -125,60 +121,9 @@ _FIELD_OF_OPTION = {
 _POSE_OPTIONS = ("noise_m", "noise_deg", "drift_m", "drift_deg")
 
 
-def _settings(given: dict[str, Any]) -> Any:
-    from pydantic import ValidationError
-
-    from hdmap_tools.errors import ConfigError, brief_problems
-    from hdmap_tools.simulate.settings import SimulationSettings
-
-    document: dict[str, Any] = {
-        field: given[name] for name, field in _FIELD_OF_OPTION.items() if given[name] is not None
-    }
+def _settings(given: dict[str, Any]) -> SimulationSettings:
+    document: dict[str, Any] = {field: given[name] for name, field in _FIELD_OF_OPTION.items()}
     if given["image_size"] is not None:
         document["image_width_px"], document["image_height_px"] = given["image_size"]
-    document["pose_errors"] = {
-        name: given[f"pose_{name}"] for name in _POSE_OPTIONS if given[f"pose_{name}"] is not None
-    }
-    try:
-        return SimulationSettings.model_validate(document)
-    except ValidationError as error:
-        raise ConfigError(f"Options: {brief_problems(error, 'the options')}.") from error
-
-
-class _Progress:
-    """Bars over images and sweeps on stderr, only where a person is watching."""
-
-    def __init__(self, enabled: bool) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TaskID,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not (enabled and console.is_terminal),
-        )
-        self._tasks: dict[str, TaskID] = {}
-
-    def __enter__(self) -> SimulationProgress:
-        self._progress.start()
-        return self._told
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def _told(self, what: str, done: int, total: int) -> None:
-        if what not in self._tasks:
-            self._tasks[what] = self._progress.add_task(what, total=total)
-        self._progress.update(self._tasks[what], completed=done)
+    document["pose_errors"] = {name: given[f"pose_{name}"] for name in _POSE_OPTIONS}
+    return settings_of(document)

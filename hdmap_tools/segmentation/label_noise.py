@@ -155,7 +155,8 @@ class NoiseFields:
         fixed = _cut(self._image_textures[-1], shape, rng)
         on_ground = _sampled(self._ground_textures[index], place)
         fixed = np.where(ground.is_ground, on_ground, fixed)
-        return field + np.float32(np.sqrt(GROUND_SHARE)) * fixed
+        field += np.float32(np.sqrt(GROUND_SHARE)) * fixed
+        return field
 
     @cached_property
     def _image_textures(self) -> list[NDArrayFloat32]:

@@ -25,7 +25,6 @@ from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.output_folder import is_result_of, require_free, result_folder
 from hdmap_tools.readers.av2 import TRUE_MAP_FILE
 from hdmap_tools.simulate import truth_files, write_log
-from hdmap_tools.simulate.build_scene import SceneBuilder
 from hdmap_tools.simulate.camera_image import render_image
 from hdmap_tools.simulate.drive_plan import DrivePlan, Shot, plan_drive
 from hdmap_tools.simulate.lidar_sweep import scan_sweep
@@ -34,7 +33,6 @@ from hdmap_tools.simulate.log_map import write_log_map
 from hdmap_tools.simulate.pose_errors import disturbed_mount, disturbed_trajectory
 from hdmap_tools.simulate.ray_caster import RayCaster
 from hdmap_tools.simulate.read_world import read_world
-from hdmap_tools.simulate.scene import Actor
 from hdmap_tools.simulate.settings import SimulationSettings
 from hdmap_tools.simulate.truth_raster import write_truth_raster
 from hdmap_tools.simulate.truth_vectors import truth_vector_map
@@ -87,9 +85,8 @@ def simulate_drive(
     with result_folder(out, COMMAND, overwrite) as log:
         truth = log / truth_files.TRUTH_FOLDER
         _write_tables(log, truth, plan, world_path)
-        builder = SceneBuilder(plan.world, settings, plan.terrain)
-        _write_true_map(truth, plan, builder, progress)
-        _Recorder(log, truth, plan, builder, progress).record()
+        _write_true_map(truth, plan, progress)
+        _Recorder(log, truth, plan, progress).record()
     return out
 
 
@@ -110,7 +107,7 @@ def _write_tables(log: Path, truth: Path, plan: DrivePlan, world_path: Path) -> 
         given(plan.lidar.ego_SE3_lidar, plan.lidar.name),
     )
     write_log.write_map_frame(log, plan.world.frame)
-    write_log_map(log, plan.log_id, plan.world, plan.route.xy, plan.terrain.height_at)
+    write_log_map(log, plan.log_id, plan.world, plan.route.xy, plan.builder.terrain.height_at)
     write_log.write_poses(truth, plan.city_SE3_ego)
     write_log.write_json(
         truth / "simulation.json",
@@ -121,17 +118,15 @@ def _write_tables(log: Path, truth: Path, plan: DrivePlan, world_path: Path) -> 
     truth_files.write_label_folder_head(truth)
 
 
-def _write_true_map(
-    truth: Path, plan: DrivePlan, builder: SceneBuilder, progress: SimulationProgress | None
-) -> None:
+def _write_true_map(truth: Path, plan: DrivePlan, progress: SimulationProgress | None) -> None:
     """Class raster and vector map of what the sensors are going to see."""
 
     def told(done: int, total: int) -> None:
         if progress is not None:
             progress("tiles", done, total)
 
-    write_truth_raster(truth / "raster", builder, plan.route, progress=told)
-    write_gpkg(truth_vector_map(builder, plan.route), truth / Path(TRUE_MAP_FILE).name)
+    write_truth_raster(truth / "raster", plan.builder, plan.route, progress=told)
+    write_gpkg(truth_vector_map(plan.builder, plan.route), truth / Path(TRUE_MAP_FILE).name)
 
 
 class _Recorder:
@@ -142,13 +137,10 @@ class _Recorder:
         log: Path,
         truth: Path,
         plan: DrivePlan,
-        builder: SceneBuilder,
         progress: SimulationProgress | None,
     ) -> None:
         self._log, self._truth, self._plan = log, truth, plan
         self._progress = progress
-        self._builder = builder
-        self._actors: tuple[Actor, ...] = ()
         num_sweeps = sum(shot.camera is None for shot in plan.shots)
         self._total = {"images": len(plan.shots) - num_sweeps, "sweeps": num_sweeps}
         self._done = dict.fromkeys(self._total, 0)
@@ -182,7 +174,7 @@ class _Recorder:
         self, pool: ThreadPoolExecutor, stretch_m: tuple[float, float], shots: Sequence[Shot]
     ) -> None:
         plan = self._plan
-        scene = self._builder.scene(plan.route, stretch_m, self._actors)
+        scene = plan.builder.scene(plan.route, stretch_m, plan.actors)
         _log.info(
             "Stretch %.0f to %.0f m: %d triangles, %d actors, %d images and sweeps.",
             *stretch_m,
@@ -229,7 +221,9 @@ class _Recorder:
         )
         points = sweep.points_ego
         if not self._is_exact:
-            points = self._given_SE3_ego.transform_from(points).astype(np.float32)
+            points = self._given_SE3_ego.transform_from(points.astype(np.float64)).astype(
+                np.float32
+            )
         self._submit(
             pool,
             write_log.write_sweep,

@@ -11,10 +11,12 @@ import numpy as np
 from hdmap_tools.errors import WorldError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.simulate.build_scene import SceneBuilder
 from hdmap_tools.simulate.route import Route, motion_along, places_along, plan_route
+from hdmap_tools.simulate.scene import Actor
 from hdmap_tools.simulate.sensor_rigs import LidarModel, cameras_of, lidar_of
 from hdmap_tools.simulate.settings import SimulationSettings
-from hdmap_tools.simulate.terrain import Terrain
+from hdmap_tools.simulate.traffic import build_actors
 from hdmap_tools.simulate.vehicle_motion import vehicle_trajectory
 from hdmap_tools.simulate.world_map import WorldMap
 from hdmap_tools.types import NDArrayFloat
@@ -49,7 +51,8 @@ class DrivePlan:
     Attributes:
         world, settings: As given.
         route: Where it goes.
-        terrain: The ground.
+        builder: Of the scenes; its terrain is the ground.
+        actors: All that moves during the drive.
         start_ns: Time of second 0.
         times_s, arc_m: (K,) when the vehicle is how far along the route.
         city_SE3_ego: True poses, at `POSE_HZ` and at the time of every shot.
@@ -60,7 +63,8 @@ class DrivePlan:
     world: WorldMap
     settings: SimulationSettings
     route: Route
-    terrain: Terrain
+    builder: SceneBuilder
+    actors: tuple[Actor, ...]
     start_ns: int
     times_s: NDArrayFloat
     arc_m: NDArrayFloat
@@ -107,7 +111,8 @@ def plan_drive(world: WorldMap, settings: SimulationSettings) -> DrivePlan:
             seen anything.
     """
     route = plan_route(world, settings.length_m, settings.start, settings.seed)
-    terrain = Terrain(settings.seed)
+    builder = SceneBuilder(world, settings)
+    terrain = builder.terrain
     cameras = cameras_of(settings.camera_rig, settings.image_width_px, settings.image_height_px)
     lidar = lidar_of(settings.lidar, settings.lidar_hz, settings.seed)
     start_ns = start_time_ns(settings.seed)
@@ -126,17 +131,18 @@ def plan_drive(world: WorldMap, settings: SimulationSettings) -> DrivePlan:
     all_ns = np.union1d(knots_ns, [shot.timestamp_ns for shot in shots])
     poses = Trajectory(all_ns, *moved.interpolate_many(all_ns))
     return DrivePlan(
-        world,
-        settings,
-        route,
-        terrain,
-        start_ns,
-        times_s,
-        arc_m,
-        poses,
-        tuple(cameras),
-        lidar,
-        shots,
+        world=world,
+        settings=settings,
+        route=route,
+        builder=builder,
+        actors=build_actors(world, route, times_s, arc_m, settings, terrain, builder.index),
+        start_ns=start_ns,
+        times_s=times_s,
+        arc_m=arc_m,
+        city_SE3_ego=poses,
+        cameras=tuple(cameras),
+        lidar=lidar,
+        shots=tuple(shots),
     )
 
 
