@@ -17,7 +17,8 @@ def count_into(
         counts: (K, rows, cols) int32, changed in place.
         codes: (R, C) uint8 of the fine cells.
         kinds: (256,) uint8 from code to kind; those of K and above are not counted.
-        row, col: Where codes[0, 0] lies in fine cells from the corner of counts.
+        row: Where codes[0, 0] lies, in fine cells from the corner of counts.
+        col: The same along the other axis.
         n: Fine cells a coarse one, along each axis.
     """
     for r in range(codes.shape[0]):
