@@ -68,4 +68,6 @@ def command(**given: Any) -> None:
     click.echo(
         f"Temperature {report.temperature:.4g}: --set observation.temperature={report.temperature:.4g}"
     )
+    shares = ", ".join(f"{name} {share:.3f}" for name, share in report.class_shares.items())
+    click.echo(f"True shares where it was fitted, to hold against observation.priors: {shares}")
     click.echo(f"Diagram: {given['out'] / PICTURE_NAME}")

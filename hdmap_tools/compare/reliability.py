@@ -84,6 +84,9 @@ class ReliabilityReport(BaseModel):
         temperature: To be used as ``observation.temperature``: fitted on one half of the area.
         temperature_before: The one the map was read with.
         num_cells_fitted: Cells of that half.
+        class_shares: Share of each of the classes in that half. Where a network cannot tell
+            some of them apart, no temperature mends a prior that is far from these
+            (``observation.priors``, ``observation.other_prior``).
         before: The other half, as the map was read.
         after: The other half, with the fitted temperature.
         rule: Which cells are which half.
@@ -97,6 +100,7 @@ class ReliabilityReport(BaseModel):
     temperature: Annotated[float, Field(gt=0)]
     temperature_before: Annotated[float, Field(gt=0)]
     num_cells_fitted: _Count
+    class_shares: dict[str, _Share] = Field(default_factory=dict)
     before: ReliabilityCurve
     after: ReliabilityCurve
     rule: str
@@ -272,6 +276,9 @@ def assess(
         temperature=temperature * fit.temperature,
         temperature_before=temperature,
         num_cells_fitted=fit.num_cells,
+        class_shares={
+            name: float((index[told & fits] == k).mean()) for k, name in enumerate(truth.names)
+        },
         before=curve(1.0),
         after=curve(fit.temperature),
         rule=rule,

@@ -117,6 +117,8 @@ def test_the_report_judges_where_it_did_not_fit():
     report = assess(cells, truth, board, "squares", temperature=2.0)
     assert report.temperature == pytest.approx(12.0, rel=0.05)
     assert report.num_cells_fitted == board.sum()
+    expected = np.bincount(index[board], minlength=4) / board.sum()
+    assert list(report.class_shares.values()) == pytest.approx(expected.tolist())
     assert report.before.num_cells == report.after.num_cells == (~board).sum()
     assert report.before.ece > 0.15
     assert report.after.ece < 0.015
