@@ -25,7 +25,7 @@ from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.readers.image import read_image
 from hdmap_tools.run_metrics import RunMetrics, versions
 from hdmap_tools.segmentation.cache import LabelCache
-from hdmap_tools.segmentation.open_segmenter import find_model, open_segmenter
+from hdmap_tools.segmentation.open_segmenter import SIMULATED, find_model, open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
@@ -158,6 +158,8 @@ def settled(config: Config, drive: Drive) -> Config:
     if model is None and segmentation.labels is None:
         model = find_model(drive.root)
         _LOG.info("Using the model %s.", model)
+    if str(model) != SIMULATED:
+        model = _absolute(model)
     reference = compare.reference
     if reference is None:
         # A vector map does not say where it ends; cells do.
@@ -168,7 +170,7 @@ def settled(config: Config, drive: Drive) -> Config:
     return config.model_copy(
         update={
             "segmentation": segmentation.model_copy(
-                update={"model": _absolute(model), "labels": _absolute(segmentation.labels)}
+                update={"model": model, "labels": _absolute(segmentation.labels)}
             ),
             "association": association.model_copy(update={"points": _absolute(association.points)}),
             "observation": observation.model_copy(

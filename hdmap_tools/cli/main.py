@@ -34,6 +34,8 @@ _COMMANDS: Final = {
     "reliability": "Hold a map's probabilities against truth, and fit the temperature that makes them true.",
     "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
     "simulate": "Drive through a map: images, lidar sweeps, poses, and their exact truth.",
+    "evaluate": "Measure the paper's methods and ours on simulated drives with exact truth.",
+    "demo": "Simulate a short drive, map it, and hold the map against the truth.",
     "info": "Say what a drive, a semantic map or a vector file holds.",
     "plugins": "List, describe and check vectorizer plugins.",
 }

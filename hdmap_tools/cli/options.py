@@ -174,7 +174,7 @@ def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
     from hdmap_tools.config import load_config
     from hdmap_tools.errors import ConfigError
 
-    require_free_json(given["json_path"], given["overwrite"])
+    require_free_json(given.get("json_path"), given["overwrite"])
     dotted: dict[str, Any] = {}
     for setting in given["settings"]:
         name, equals, value = setting.partition("=")
