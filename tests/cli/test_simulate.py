@@ -32,6 +32,7 @@ def test_a_shipped_world_by_its_name(hdmap, here):
     assert "vector_map.gpkg" in out
 
 
+@pytest.mark.slow
 def test_the_other_commands_take_it(hdmap, here, simulated_drive):
     shutil.copytree(simulated_drive, "drive")
     code, out, err = hdmap("run", "drive", "-o", "out", "--labels", "drive/truth/label_images")

@@ -176,6 +176,7 @@ def test_the_data_sets_package_loads_map_and_ground(simulated_drive):
     ).all()
 
 
+@pytest.mark.slow
 def test_the_same_settings_give_the_same_bytes_and_another_seed_others(tmp_path):
     world = shipped_world()
     one = bytes_of(simulate_drive(world, tmp_path / "one", TINY))
@@ -188,6 +189,7 @@ def test_the_same_settings_give_the_same_bytes_and_another_seed_others(tmp_path)
     assert not np.array_equal(other.city_SE3_ego.translations, this.city_SE3_ego.translations)
 
 
+@pytest.mark.slow
 def test_errors_are_on_what_is_given_and_truth_is_kept(tmp_path):
     errors = PoseErrors(noise_m=0.05, noise_deg=0.2, drift_m=0.3)
     settings = TINY.model_copy(
@@ -268,6 +270,7 @@ def test_the_vehicle_keeps_to_the_limits_of_a_vehicle():
     assert 0.0 < roll_pitch < 0.2
 
 
+@pytest.mark.slow
 def test_nothing_is_left_when_it_fails_on_the_way(tmp_path, monkeypatch):
     def broken(*_args, **_options):
         raise RuntimeError("the disk is full")
