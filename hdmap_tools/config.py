@@ -90,8 +90,8 @@ class PointsConfig(_Step):
         voxel_mm: Returns are thinned to one point a voxel of this edge.
         cell_mm: Cells that have a ground height; a whole number of voxels, and 25.6 m
             are a whole number of cells.
-        min_range_m, max_range_m: Returns nearer to or further from the ego origin (in
-            x-y) are not used: the vehicle itself; what a small error of the pose moves.
+        min_range_m: Returns nearer to the ego origin (in x-y) are not used: the vehicle itself.
+        max_range_m: Nor are those further away, which a small error of the pose moves.
         ground_tolerance_m: How far above or below the estimated ground a return still
             is ground.
         remove_moving: Leave out what later or earlier sweeps saw through.
@@ -131,8 +131,8 @@ class AssociationConfig(_Step):
             it is not said: ``dense`` with `points`, ``surface`` without.
         points: The point map (`hdmap points`), or a point cloud, for ``dense``; its
             poses of the drive are then used by every method. None: ``dense`` makes one first.
-        clip_ahead_m, clip_across_m: ``dense``: points up to so far ahead of the ego
-            origin, and to either side, are labelled.
+        clip_ahead_m: ``dense``: points up to so far ahead of the ego origin are labelled,
+        clip_across_m: and up to so far to either side.
         also: Methods that `hdmap run` builds in memory beside it, to compare with;
             those that need lidar are left out where there is none.
         min_range_m: Ground nearer to the camera (in x-y) is not used: there the image
