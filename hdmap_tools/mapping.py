@@ -61,19 +61,60 @@ class FrameCounts:
     observations: Counter[str] = field(default_factory=Counter)
 
 
+class GroundedSweeps:
+    """The sweeps near a drive's images, each with its ground; keeps the last, which several cameras share."""
+
+    def __init__(self, drive: Drive, config: Config) -> None:
+        self._drive = drive
+        self._config = config
+        self._last: tuple[int, GroundedSweep] | None = None
+
+    def ref(self, image: ImageRef) -> SweepRef | None:
+        """The sweep nearest to an image in time, if it is near enough and has a pose."""
+        config = self._config.drive
+        ref = self._drive.nearest_sweep(image.timestamp_ns, config.max_sweep_gap_s)
+        if ref is None:
+            return None
+        time = np.array([ref.timestamp_ns], dtype=np.int64)
+        has_pose = self._drive.trajectory.covers(time, config.max_pose_gap_s)[0]
+        return ref if has_pose else None
+
+    def near(self, image: ImageRef) -> GroundedSweep | None:
+        """The sweep nearest to an image, with its ground."""
+        ref = self.ref(image)
+        if ref is None:
+            return None
+        if self._last is None or self._last[0] != ref.timestamp_ns:
+            sweep = self._drive.read_sweep(ref)
+            association = self._config.association
+            grounded = GroundedSweep.from_sweep(
+                sweep,
+                self._drive.trajectory.interpolate(
+                    sweep.timestamp_ns, self._config.drive.max_pose_gap_s
+                ),
+                association.max_range_m,
+                association.ground_tolerance_m,
+            )
+            self._last = (ref.timestamp_ns, grounded)
+        return self._last[1]
+
+
 class FrameSource:
     """Poses and sweeps of a drive's images, and the point map around them.
 
-    Keeps the last sweep, which several cameras share.
+    Args:
+        drive: The drive, at the poses to be used.
+        config: How its images are associated.
+        sweeps: Sweeps of the same drive, shared with another source.
 
     Raises:
         PointMapError: If a method needs a point map and there is none to open.
     """
 
-    def __init__(self, drive: Drive, config: Config) -> None:
+    def __init__(self, drive: Drive, config: Config, sweeps: GroundedSweeps | None = None) -> None:
         self._drive = drive
         self._config = config
-        self._grounded: tuple[int, GroundedSweep] | None = None
+        self.sweeps = sweeps or GroundedSweeps(drive, config)
         self._points: PointMap | None = None
         if config.association.needs_points:
             if config.association.points is None:
@@ -130,30 +171,11 @@ class FrameSource:
 
     def sweep_ref(self, image: ImageRef) -> SweepRef | None:
         """The sweep nearest to an image in time, if it is near enough and has a pose."""
-        config = self._config.drive
-        ref = self._drive.nearest_sweep(image.timestamp_ns, config.max_sweep_gap_s)
-        if ref is None:
-            return None
-        time = np.array([ref.timestamp_ns], dtype=np.int64)
-        has_pose = self._drive.trajectory.covers(time, config.max_pose_gap_s)[0]
-        return ref if has_pose else None
+        return self.sweeps.ref(image)
 
     def grounded_sweep(self, image: ImageRef) -> GroundedSweep | None:
         """The sweep nearest to an image, with its ground."""
-        ref = self.sweep_ref(image)
-        if ref is None:
-            return None
-        if self._grounded is None or self._grounded[0] != ref.timestamp_ns:
-            sweep = self._drive.read_sweep(ref)
-            association = self._config.association
-            grounded = GroundedSweep.from_sweep(
-                sweep,
-                self.pose(sweep.timestamp_ns),
-                association.max_range_m,
-                association.ground_tolerance_m,
-            )
-            self._grounded = (ref.timestamp_ns, grounded)
-        return self._grounded[1]
+        return self.sweeps.near(image)
 
     def observe(
         self,

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -90,7 +90,8 @@ class _Learned:
 
     confusion: ConfusionMatrix
     intensity: IntensityLikelihood
-    temperature: float
+    priors: dict[str, float]
+    temperature: float = 1.0
 
 
 def evaluate_drive(
@@ -173,7 +174,8 @@ def _learn(
             raise ConfigError(f"Calibration drive {drive.name} saw no ground.")
         shares = TruthOfDrive.of(drive).shares(grid)
         intensity = learn_from_truth(made, grid, shares, _NAMES, f"simulated drive {drive.name}")
-        model = _model(OUR_METHODS[-1], made.meta, confusion, intensity, 1.0)
+        learned = _Learned(confusion, intensity, _class_shares(made, grid, shares))
+        model = _model(OUR_METHODS[-1], made.meta, learned)
         truth = truth_of_classes(
             true_classes(shares, _NAMES), (*_NAMES, OTHER), model.classes, drive.name
         )
@@ -183,7 +185,20 @@ def _learn(
     _LOG.info(
         "Temperature %.2f, fitted on %d cells of %s.", fit.temperature, fit.num_cells, drive.id
     )
-    return _Learned(confusion, intensity, fit.temperature)
+    return replace(learned, temperature=fit.temperature)
+
+
+def _class_shares(made: SemanticMap, grid: BevGrid, shares: NDArrayFloat) -> dict[str, float]:
+    """Share of each class, and of ``other``, in the true area of the cells that a map knows."""
+    seen = made.window(grid).layers["counts"].any(axis=(0, 1)) & np.isfinite(shares).all(axis=0)
+    mean = shares[:, seen].mean(axis=1)
+    rest = max(1.0 - float(mean.sum()), 0.0)
+    # No class is impossible because one drive did not meet it.
+    least = 1e-3
+    found = {name: max(float(m), least) for name, m in zip(_NAMES, mean, strict=True)}
+    found[OTHER] = max(rest, least)
+    total = sum(found.values())
+    return {name: share / total for name, share in found.items()}
 
 
 def _scored(
@@ -205,13 +220,7 @@ def _scored(
     gap = config.drive.max_pose_gap_s
     poses = [drive.trajectory.interpolate(image.timestamp_ns, gap) for image in drive.images]
     models = {
-        m.name: _model(
-            m,
-            maps[m.map_name].meta,
-            learned.confusion,
-            learned.intensity,
-            learned.temperature if m.uses_temperature else 1.0,
-        )
+        m.name: _model(m, maps[m.map_name].meta, learned)
         for m in (*PAPER_METHODS, *OUR_METHODS, *MODE_METHODS)
     }
     # Compared is what the drive could see: cells with a point that fell into an image.
@@ -308,17 +317,17 @@ def _scores(
     )
 
 
-def _model(
-    method: Method,
-    meta: MapMeta,
-    confusion: ConfusionMatrix,
-    intensity: IntensityLikelihood,
-    temperature: float,
-) -> ObservationModel:
-    config = ObservationConfig.model_validate({**method.observation, "temperature": temperature})
-    model = observation_model(config, meta, MAP_CLASSES, confusion)
+def _model(method: Method, meta: MapMeta, learned: _Learned) -> ObservationModel:
+    given: dict[str, Any] = dict(method.observation)
+    if method.uses_temperature:
+        given["temperature"] = learned.temperature
+    if method.uses_priors:
+        given["priors"] = {name: learned.priors[name] for name in _NAMES}
+        given["other_prior"] = learned.priors[OTHER]
+    config = ObservationConfig.model_validate(given)
+    model = observation_model(config, meta, MAP_CLASSES, learned.confusion)
     if method.uses_learned_intensity:
-        model = model.with_intensity(intensity, config.intensity_weight)
+        model = model.with_intensity(learned.intensity, config.intensity_weight)
     return model
 
 

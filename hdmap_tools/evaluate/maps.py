@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +20,7 @@ from hdmap_tools.mapping import (
     IMAGES_PER_SEGMENT,
     FrameCounts,
     FrameSource,
+    GroundedSweeps,
     LabelledImages,
     frame_key,
     intensity_threshold,
@@ -95,8 +96,9 @@ def fuse_variants(
         Maps by name of their variant.
     """
     reach = max(variant.ahead_m[1] for variant in variants)
+    sweeps = GroundedSweeps(drive, config)
     sources = {
-        tested: FrameSource(drive, _configured(config, tested, reach))
+        tested: FrameSource(drive, _configured(config, tested, reach), sweeps)
         for tested in sorted({variant.occlusion_test for variant in variants})
     }
     first = next(iter(sources.values()))
@@ -161,8 +163,3 @@ def _configured(config: Config, occlusion_test: bool, reach_m: float) -> Config:
         }
     )
     return config.model_copy(update={"association": association})
-
-
-def at_poses_of(drive: Drive, other: Drive) -> Drive:
-    """A drive at the poses of another of the same place and time."""
-    return replace(drive, trajectory=other.trajectory)

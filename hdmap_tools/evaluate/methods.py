@@ -48,6 +48,7 @@ class Method:
         name: In tables; the paper's four are named as there.
         map_name: The variant that is read.
         observation: Fields of `ObservationConfig` that differ from its defaults.
+        uses_priors: Whether the class shares of the calibration drive are the prior.
         uses_learned_intensity: Whether the likelihood learned on the calibration drive is used.
         uses_temperature: Whether the temperature fitted there is used.
     """
@@ -55,6 +56,7 @@ class Method:
     name: str
     map_name: str
     observation: dict[str, Any] = field(default_factory=dict)
+    uses_priors: bool = False
     uses_learned_intensity: bool = False
     uses_temperature: bool = False
 
@@ -72,10 +74,19 @@ PAPER_METHODS: Final[tuple[Method, ...]] = (
 
 OUR_METHODS: Final[tuple[Method, ...]] = (
     Method("visible", OUR_MAP, _OURS),
-    Method("visible+learned", OUR_MAP, _OURS, uses_learned_intensity=True),
-    Method("ours", OUR_MAP, _OURS, uses_learned_intensity=True, uses_temperature=True),
+    Method("+ priors", OUR_MAP, _OURS, uses_priors=True),
+    Method("+ intensity", OUR_MAP, _OURS, uses_priors=True, uses_learned_intensity=True),
+    Method(
+        "ours",
+        OUR_MAP,
+        _OURS,
+        uses_priors=True,
+        uses_learned_intensity=True,
+        uses_temperature=True,
+    ),
 )
-"""Occlusion test and ``other``; the learned intensity on top; the fitted temperature on top."""
+"""Occlusion test and the class ``other``; then, each on top of the one before, priors and
+intensity as learned on the calibration drive, and the temperature fitted there."""
 
 MODE_METHODS: Final[tuple[Method, ...]] = (
     Method("CFN, count mode frame", "clip_frame", {**_PAPER, "model": "confusion"}),
