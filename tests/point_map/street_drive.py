@@ -17,10 +17,12 @@ MOUNT_M = 1.9
 class Street:
     """Triangles of a street along x: ground with kerbs, and what stands beside it."""
 
-    def __init__(self, length_m: float, *, is_bare: bool = False, seed: int = 0) -> None:
+    def __init__(
+        self, length_m: float, *, is_bare: bool = False, seed: int = 0, wave_m: float = 0.15
+    ) -> None:
         self._scene = open3d().t.geometry.RaycastingScene()
         rng = np.random.default_rng(seed)
-        self._add_ground(length_m, is_bare)
+        self._add_ground(length_m, is_bare, wave_m)
         if is_bare:
             return
         for side in (-1, 1):
@@ -35,14 +37,14 @@ class Street:
             for x in np.arange(-5, length_m, 24.0) + rng.uniform(0, 9):
                 self._box((x, side * 3.0), (x + 4.3, side * 4.8), 1.5)
 
-    def _add_ground(self, length_m: float, is_bare: bool) -> None:
+    def _add_ground(self, length_m: float, is_bare: bool, wave_m: float) -> None:
         # Road with crown, kerb 12 cm (a shallow bank between lawns), ground beyond, gentle waves.
         y = np.array([-60, -4.2, -4.1, 0, 4.1, 4.2, 60.0])
         z = np.array([0.3, 0.12, 0, 0.08, 0, 0.12, 0.3])
         if is_bare:
             y = np.array([-60, -6, -4.1, 0, 4.1, 6, 60.0])
         x = np.arange(-80, length_m + 80, 4.0)
-        waves = 0.0 if is_bare else 0.15 * np.sin(x / 23.0)
+        waves = 0.0 if is_bare else wave_m * np.sin(x / 23.0)
         grid = np.stack(
             np.broadcast_arrays(x[:, None], y[None], z[None] + np.c_[waves + 0 * x]), -1
         )

@@ -63,6 +63,21 @@ def test_two_drives_of_a_street_are_aligned_to_each_other(street: Street) -> Non
     assert refined[1].report.correction_m > 2 * refined[0].report.correction_m
 
 
+def test_drives_that_saw_another_place_do_not_bend_each_other(street: Street) -> None:
+    first, second = true_path(40), true_path(40, t0_s=1000)
+    given = with_errors(first, Errors(), seed=1), with_errors(second, Errors(), seed=2)
+    refined = refine_poses(
+        [
+            drive_through(street, first, given[0], name="before"),
+            drive_through(Street(40, seed=8, wave_m=0.6), second, given[1], name="rebuilt", seed=5),
+        ]
+    )
+    for poses, before, truth in zip(refined, given, (first, second), strict=True):
+        assert aligned_errors(poses.trajectory, truth)[0] < aligned_errors(before, truth)[0] / 2
+        assert poses.report.reason is not None
+        assert "contradicts the other drives" in poses.report.reason
+
+
 def test_a_straight_road_between_lawns_is_known_to_hold_nothing_along_it() -> None:
     truth = true_path(40)
     given = with_errors(truth, Errors(), seed=1)
