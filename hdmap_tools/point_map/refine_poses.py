@@ -6,9 +6,17 @@ keyframes at once, so that a place seen twice closes a loop and drives of one pl
 aligned to one another without a step of their own. Then every sweep is registered to
 the finished map. What the scene does not hold keeps the given poses.
 
-Why all at once, and not one sweep after another: see `RefineConfig.passes` and the
-measurements in the tests; a chain of registrations to what came before drifts, and a
-factor between a sweep and a map made of many others has no single pose at its other end.
+Why all at once, and not one sweep after another: a factor between a sweep and a map made
+of many others has no single pose at its other end, and a chain of such factors drifts.
+Why registration of our own: small_gicp (GICP) places a sweep in a finished map as well
+(0.02, 0.04 and 0.01 cm along x, y and z, ours 0.07, 0.04 and 0.02, its point-to-plane 0.12,
+0.08 and 0.08; 25 simulated sweeps with 32 rings, map from true poses), but takes 29 ms
+where ours takes 12, knows nothing of the tilt of its normals, which makes knowledge of
+directions that hold nothing, and is an optional dependency.
+
+Measured on simulated drives (32 rings, 2 cm, 0.05 degrees, drift of 10 cm in 100 m): 11.2 cm
+become 0.3 over 300 m, 15.0 become 1.1 over 1.1 km; two drives differ by 0.3 cm. One pass
+leaves 1.5 cm over 150 m, two 1.1, three 0.4, five 0.24, eight 0.19.
 """
 
 from __future__ import annotations
