@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from hdmap_tools.association.visibility import ring_gap_deg
 from hdmap_tools.errors import ShapeError
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.readers.drive import Sweep
-from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayBool, NDArrayFloat
 
 _SECTORS: Final = 72
 _RING_M: Final = 1.0
@@ -39,19 +38,21 @@ class GroundSurface:
     samples: NDArrayFloat
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.samples[:, :2])
+    def _bins(self) -> tuple[Any, ...]:
+        from hdmap_tools.association.ground_kernels import sorted_into_bins
+
+        bins: tuple[Any, ...] = sorted_into_bins(self.samples)
+        return bins
 
     def height_at(self, xy: NDArrayFloat) -> NDArrayFloat:
         """Height (N,) at positions (N, 2), metres; NaN further than 4 m from ground seen."""
         if len(self.samples) == 0 or len(xy) == 0:
             return np.full(len(xy), np.nan)
-        neighbours = min(6, len(self.samples))
-        distance, index = self._tree.query(xy[:, :2], k=neighbours)
-        distance, index = distance.reshape(len(xy), -1), index.reshape(len(xy), -1)
-        weight = 1.0 / (distance + 0.1) ** 2
-        height = (weight * self.samples[index, 2]).sum(axis=1) / weight.sum(axis=1)
-        return np.where(distance[:, 0] <= _REACH_M, height, np.nan)
+        from hdmap_tools.association.ground_kernels import heights_between
+
+        xy = np.ascontiguousarray(xy, dtype=np.float64)
+        height: NDArrayFloat = heights_between(xy, *self._bins, _REACH_M)
+        return height
 
     def plane(self, max_range_m: float = 15.0) -> tuple[float, float, float] | None:
         """(a, b, c) of ``z = a x + b y + c`` through the ground within a range; None without any."""
@@ -131,7 +132,9 @@ def estimate_ground(points: NDArrayFloat, max_range_m: float = 60.0) -> GroundSu
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
     ring = np.floor(distance / _RING_M).astype(np.int64)
     num_rings = int(max_range_m / _RING_M) + 1
-    low = _low_heights(sector * num_rings + ring, points[:, 2], _SECTORS * num_rings)
+    from hdmap_tools.association.ground_kernels import low_heights
+
+    low = low_heights(sector * num_rings + ring, points[:, 2], _SECTORS * num_rings)
     low = low.reshape(_SECTORS, num_rings)
 
     seed_cells = low[:, : int(_SEED_RANGE_M / _RING_M)]
@@ -163,16 +166,13 @@ def estimate_ground(points: NDArrayFloat, max_range_m: float = 60.0) -> GroundSu
 
 def near_ground(points: NDArrayFloat, surface: GroundSurface, tolerance_m: float) -> NDArrayBool:
     """Which points (N, 3) lie within a tolerance of the ground; where it is unknown, none."""
+    near = np.zeros(len(points), dtype=bool)
+    if len(surface.samples) == 0:
+        return near
+    # A height is a mean of samples, so what lies above or below them all is not asked for.
+    low, high = surface.samples[:, 2].min(), surface.samples[:, 2].max()
+    slack_m = tolerance_m + 1e-6
+    may_be = np.flatnonzero((points[:, 2] >= low - slack_m) & (points[:, 2] <= high + slack_m))
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(points[:, 2] - surface.height_at(points[:, :2])) <= tolerance_m)
-
-
-def _low_heights(cell: NDArrayInt, heights: NDArrayFloat, num_cells: int) -> NDArrayFloat:
-    """A low height of each cell (10th percentile, robust to single returns from below); NaN if empty."""
-    order = np.lexsort((heights, cell))
-    sorted_cell, sorted_height = cell[order], heights[order]
-    starts = np.flatnonzero(np.concatenate([[True], sorted_cell[1:] != sorted_cell[:-1]]))
-    counts = np.diff(np.append(starts, len(order)))
-    low = np.full(num_cells, np.nan)
-    low[sorted_cell[starts]] = sorted_height[starts + counts // 10]
-    return low
+        near[may_be] = np.abs(points[may_be, 2] - surface.height_at(points[may_be])) <= tolerance_m
+    return near

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdmap_tools.errors import ShapeError
-from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayByte, NDArrayFloat
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +20,14 @@ class Observations:
         intensity: (N,) uint8 lidar intensity; None when there is none at all.
         has_intensity: (N,) bool: where a return measured it; None means everywhere.
             A vote without intensity counts into the lowest bin: it is no sign of paint.
+        range_m: (N,) metres over ground from the camera; None where nothing asks for it.
     """
 
     points_city: NDArrayFloat
     labels: NDArrayByte
     intensity: NDArrayByte | None = None
     has_intensity: NDArrayBool | None = None
+    range_m: NDArrayFloat | None = None
 
     def __post_init__(self) -> None:
         count = len(self.labels)
@@ -46,6 +48,8 @@ class Observations:
             self.intensity is None or self.has_intensity.shape != (count,)
         ):
             raise ShapeError("has_intensity must be (N,) and come with intensity.")
+        if self.range_m is not None and self.range_m.shape != (count,):
+            raise ShapeError(f"range_m must be (N,), found {self.range_m.shape}.")
         if not np.isfinite(self.points_city).all():
             raise ShapeError(
                 "Observations hold NaN or infinite points; readers and association drop them first."
@@ -53,3 +57,14 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def chosen(self, rows: NDArrayAny) -> Observations:
+        """Those of the rows, by number or (N,) bool."""
+        intensity, has_intensity, range_m = self.intensity, self.has_intensity, self.range_m
+        return Observations(
+            self.points_city[rows],
+            self.labels[rows],
+            None if intensity is None else intensity[rows],
+            None if has_intensity is None else has_intensity[rows],
+            None if range_m is None else range_m[rows],
+        )

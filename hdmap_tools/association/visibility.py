@@ -89,7 +89,10 @@ def ring_gap_deg(points_ego: NDArrayFloat, ring: NDArrayByte) -> float:
     elevation = np.rad2deg(
         np.arctan2(points_ego[far, 2] - _LIDAR_HEIGHT_M, np.maximum(distance[far], 1e-6))
     )
-    medians = [float(np.median(elevation[ring[far] == r])) for r in rings if (ring[far] == r).any()]
+    # By ring, sorted once: bytes sort in one pass.
+    order = np.argsort(ring[far], kind="stable")
+    parts = np.split(elevation[order], np.cumsum(np.bincount(ring[far], minlength=256))[:-1])
+    medians = [float(np.median(part)) for part in parts if len(part)]
     if len(medians) < 4:
         return _WIDEST_RING_GAP_DEG
     gaps = np.diff(np.sort(medians))
