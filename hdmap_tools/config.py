@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import reprlib
@@ -182,6 +183,18 @@ WholeMillimetres = Annotated[float, AfterValidator(_is_whole_millimetres)]
 """Metres that are a whole number of millimetres."""
 
 
+def _rises(edges: tuple[float, ...]) -> tuple[float, ...]:
+    if any(b <= a for a, b in itertools.pairwise((0.0, *edges))):
+        raise ValueError("must be above 0 and rise")
+    return edges
+
+
+RangeEdges = Annotated[
+    tuple[Annotated[float, Field(gt=0, le=1000)], ...], Field(max_length=8), AfterValidator(_rises)
+]
+"""Distances in metres at which bands of range begin, beyond the first that begins at 0."""
+
+
 class FusionConfig(_Step):
     """How frames become counts.
 
@@ -193,12 +206,16 @@ class FusionConfig(_Step):
             a point).
         intensity_threshold: k, the intensity 0..255 from which on a return looks
             like paint; ``auto`` estimates it by Otsu's method on road points.
+        range_edges_m: Distances from the camera at which a new band begins, whose votes
+            are counted apart, so that a confusion matrix measured by range can be used (`hdmap
+            confusion --range-bands`). Each band takes as much memory as all do without.
         reference_height_m: City height that stored heights count from, in whole millimetres.
     """
 
     resolution_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
     count_mode: Literal["majority", "share", "frame", "point"] = "share"
     intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
+    range_edges_m: RangeEdges = ()
     reference_height_m: WholeMillimetres = 0.0
 
 

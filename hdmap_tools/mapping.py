@@ -6,7 +6,7 @@ import hashlib
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ import numpy as np
 
 from hdmap_tools.association.dense import associate_dense, clip_bounds_m
 from hdmap_tools.association.ground import GroundedSweep
+from hdmap_tools.association.lookup import camera_position
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.planar import associate_planar, ground_plane
 from hdmap_tools.association.sparse import associate_sparse
@@ -186,6 +187,21 @@ class FrameSource:
         resolution_m: float,
     ) -> Observations:
         """What one image says about the ground, by one method of association."""
+        seen = self._associate(method, image, labels, label_set, resolution_m)
+        if not self._config.fusion.range_edges_m:
+            return seen
+        camera = camera_position(self._drive.cameras[image.camera], self.pose(image.timestamp_ns))
+        away = np.linalg.norm(seen.points_city[:, :2] - camera[:2], axis=1)
+        return replace(seen, range_m=away)
+
+    def _associate(
+        self,
+        method: str,
+        image: ImageRef,
+        labels: NDArrayByte,
+        label_set: LabelSet,
+        resolution_m: float,
+    ) -> Observations:
         config: AssociationConfig = self._config.association
         camera = self._drive.cameras[image.camera]
         pose, grounded = self.pose(image.timestamp_ns), self.grounded_sweep(image)
@@ -229,6 +245,7 @@ def map_meta(
         label_set=label_set,
         count_mode=config.fusion.count_mode,
         intensity_threshold=threshold,
+        range_edges_m=config.fusion.range_edges_m,
         reference_height_m=config.fusion.reference_height_m,
         frame_document=drive.frame.to_json(),
         model=model,

@@ -87,6 +87,7 @@ def settings_of(config: Config, meta: MapMeta) -> Config:
             "resolution_m": meta.resolution_m,
             "count_mode": meta.count_mode,
             "intensity_threshold": meta.intensity_threshold,
+            "range_edges_m": meta.range_edges_m,
             "reference_height_m": meta.reference_height_m,
         }
     )

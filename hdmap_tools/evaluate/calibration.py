@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hdmap_tools.compare.truth_reference import true_shares
+from hdmap_tools.drive_confusion import confusion_of_drive
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.grid import BevGrid
-from hdmap_tools.readers.drive import Drive
+from hdmap_tools.labels.label_set import LabelSet
+from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
-from hdmap_tools.segmentation.label_png import read_label_png
-from hdmap_tools.segmentation.precomputed import label_path
 from hdmap_tools.segmentation.segmenter import Segmenter
-from hdmap_tools.simulate.truth_files import LABEL_IMAGES, TRUTH_FOLDER, true_label_set
+from hdmap_tools.simulate.truth_files import LABEL_IMAGES, TRUTH_FOLDER
 from hdmap_tools.simulate.truth_raster import TruthRaster
-from hdmap_tools.types import NDArrayFloat
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,29 +50,49 @@ class TruthOfDrive:
 
 
 def confusion_of_drives(
-    drives: Sequence[Drive], segmenters: Sequence[Segmenter], cache: LabelCache | None = None
+    drives: Sequence[Drive],
+    segmenters: Sequence[Segmenter],
+    range_edges_m: Sequence[float],
+    cache: LabelCache | None = None,
 ) -> ConfusionMatrix:
-    """How often a segmenter says which label, over all images of simulated drives.
+    """How often a segmenter says which label, over all images of simulated drives, by range.
 
     Args:
         drives: With true label images.
         segmenters: The same one, opened for each drive.
+        range_edges_m: Where bands of distance begin, from 0.
         cache: Where label images are kept.
 
     Raises:
-        ConfigError: If a drive has no truth, or there is no image.
+        ConfigError: If a drive has no image with truth.
     """
     total: ConfusionMatrix | None = None
-    true_set = true_label_set()
     for drive, segmenter in zip(drives, segmenters, strict=True):
-        folder = TruthOfDrive.of(drive).folder / LABEL_IMAGES
-        for image, predicted in segment_drive(drive, segmenter, drive.images, cache):
-            truth = read_label_png(label_path(folder, image))
-            one = ConfusionMatrix.measure(truth, predicted, true_set, segmenter.label_set)
-            total = one if total is None else total + one
-    if total is None:
-        raise ConfigError("The calibration drives have no images to measure a confusion matrix on.")
-    names = ", ".join(drive.name for drive in drives)
-    return ConfusionMatrix(
-        total.true_set, total.predicted_set, total.counts, f"simulated drives {names}"
-    )
+        kept = _Cached(drive, segmenter, cache)
+        one = confusion_of_drive(drive, kept, range_edges_m=range_edges_m)
+        total = one if total is None else total + one
+    assert total is not None
+    return total
+
+
+class _Cached:
+    """A segmenter that looks into the cache first; a `Segmenter`."""
+
+    def __init__(self, drive: Drive, segmenter: Segmenter, cache: LabelCache | None) -> None:
+        self._drive, self._segmenter, self._cache = drive, segmenter, cache
+
+    @property
+    def name(self) -> str:
+        return self._segmenter.name
+
+    @property
+    def label_set(self) -> LabelSet:
+        return self._segmenter.label_set
+
+    @property
+    def fingerprint(self) -> str:
+        return self._segmenter.fingerprint
+
+    def segment(self, image: ImageRef) -> NDArrayByte:
+        ((_, labels),) = segment_drive(self._drive, self._segmenter, [image], self._cache)
+        return labels

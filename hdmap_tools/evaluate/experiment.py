@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from hdmap_tools.compare.paper import ANY_PAINT, PaperScores, paper_scores, true_classes
+from hdmap_tools.compare.paper import (
+    ANY_PAINT,
+    PAINT_SHARE,
+    PaperScores,
+    paper_scores,
+    true_classes,
+)
 from hdmap_tools.compare.reliability import reliability, truth_of_classes
 from hdmap_tools.config import Config, ObservationConfig
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.evaluate.calibration import TruthOfDrive, confusion_of_drives
+from hdmap_tools.evaluate.decision import fit_decision, weighted
 from hdmap_tools.evaluate.maps import fuse_variants
 from hdmap_tools.evaluate.methods import (
     ASSOCIATIONS,
     BANDS_M,
     BY_RANGE,
     CLIP,
+    CONFUSION_EDGES_M,
     COUNT_MODES,
     MODE_METHODS,
     OUR_MAP,
     OUR_METHODS,
+    OURS,
     PAPER_MAP,
     PAPER_METHODS,
     Method,
@@ -92,6 +101,7 @@ class _Learned:
     intensity: IntensityLikelihood
     priors: dict[str, float]
     temperature: float = 1.0
+    decision: dict[str, float] = field(default_factory=dict)
 
 
 def evaluate_drive(
@@ -157,7 +167,7 @@ def _learn(
 ) -> _Learned:
     with steps.timed("calibrate"):
         segmenters = [open_segmenter(config.segmentation, other) for other in others]
-        confusion = confusion_of_drives(others, segmenters, cache)
+        confusion = confusion_of_drives(others, segmenters, CONFUSION_EDGES_M, cache)
     config, drive = _with_points(config, others[0], scratch / "calibration", steps)
     with steps.timed("calibrate"):
         made = fuse_variants(
@@ -175,17 +185,24 @@ def _learn(
         shares = TruthOfDrive.of(drive).shares(grid)
         intensity = learn_from_truth(made, grid, shares, _NAMES, f"simulated drive {drive.name}")
         learned = _Learned(confusion, intensity, _class_shares(made, grid, shares))
-        model = _model(OUR_METHODS[-1], made.meta, learned)
+        model = _model(replace(OURS, uses_temperature=False), made.meta, learned)
         truth = truth_of_classes(
             true_classes(shares, _NAMES), (*_NAMES, OTHER), model.classes, drive.name
         )
         cells = read_evidence(made, grid, model, truth.index >= 0)
         rows, cols = cells.cells.T
         fit = fit_temperature(cells.evidence, truth.index[rows, cols], cells.offset)
+        learned = replace(learned, temperature=fit.temperature)
+        window = read_window(made, grid, _model(OURS, made.meta, learned), 1)
+        decision = fit_decision(window.dataset["posterior"].values, truth.index, model.classes)
     _LOG.info(
-        "Temperature %.2f, fitted on %d cells of %s.", fit.temperature, fit.num_cells, drive.id
+        "Temperature %.2f on %d cells of %s; weights of the decision %s.",
+        fit.temperature,
+        fit.num_cells,
+        drive.id,
+        decision,
     )
-    return replace(learned, temperature=fit.temperature)
+    return replace(learned, decision=decision)
 
 
 def _class_shares(made: SemanticMap, grid: BevGrid, shares: NDArrayFloat) -> dict[str, float]:
@@ -231,10 +248,11 @@ def _scored(
         window = read_window(maps[method.map_name], grid, models[method.name], 1)
         bare = read_window(maps[method.map_name], grid, models[method.name], 0)
         windows[method.name] = window
+        weights = learned.decision if method.uses_decision else {}
         methods[method.name] = MethodScores(
-            filled=_scores(window, shares, mask),
-            unfilled=_scores(bare, shares, mask),
-            any_paint=_scores(window, shares, mask, ANY_PAINT),
+            filled=_scores(window, shares, mask, weights=weights),
+            unfilled=_scores(bare, shares, mask, weights=weights),
+            any_paint=_scores(window, shares, mask, ANY_PAINT, weights),
         )
     by_range, by_terrain = _by_place(drive, config, grid, maps, models["CFN"], shares, poses)
     ours = models["ours"]
@@ -260,6 +278,8 @@ def _scored(
         by_range=by_range,
         by_terrain=by_terrain,
         temperature=learned.temperature,
+        decision=learned.decision,
+        priors=learned.priors,
         reliability_before=reliability(cells.posterior(), true_of_cells, names=ours.classes),
         reliability_after=reliability(
             cells.posterior(learned.temperature), true_of_cells, names=ours.classes
@@ -309,12 +329,14 @@ def _where_known(window: MapWindow, shares: NDArrayFloat, mask: NDArrayBool) -> 
 
 
 def _scores(
-    window: MapWindow, shares: NDArrayFloat, mask: NDArrayBool, paint_share: float | None = None
+    window: MapWindow,
+    shares: NDArrayFloat,
+    mask: NDArrayBool,
+    paint_share: float = PAINT_SHARE,
+    weights: dict[str, float] | None = None,
 ) -> PaperScores:
-    given = {} if paint_share is None else {"paint_share": paint_share}
-    return paper_scores(
-        window.dataset["posterior"].values, window.classes, shares, _NAMES, mask, **given
-    )
+    posterior = weighted(window.dataset["posterior"].values, window.classes, weights or {})
+    return paper_scores(posterior, window.classes, shares, _NAMES, mask, paint_share=paint_share)
 
 
 def _model(method: Method, meta: MapMeta, learned: _Learned) -> ObservationModel:

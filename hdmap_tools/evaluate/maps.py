@@ -42,6 +42,7 @@ class MapVariant:
         occlusion_test: Whether hidden ground is left out.
         count_mode: How a frame votes.
         ahead_m: Only what lies so far ahead of the ego origin is counted.
+        range_edges_m: Bands of range whose votes are counted apart.
     """
 
     name: str
@@ -49,6 +50,7 @@ class MapVariant:
     occlusion_test: bool = True
     count_mode: CountMode = "share"
     ahead_m: tuple[float, float] = (0.0, 15.0)
+    range_edges_m: tuple[float, ...] = ()
 
 
 FAR_M: Final = 25.0
@@ -64,12 +66,7 @@ def clipped(
     """What lies in a clip of the ego frame: so far ahead of its origin, so far to either side."""
     xy = city_SE3_ego.inverse().transform_from(observations.points_city)[:, :2]
     inside = (xy[:, 0] > ahead_m[0]) & (xy[:, 0] <= ahead_m[1]) & (np.abs(xy[:, 1]) <= across_m)
-    return Observations(
-        observations.points_city[inside],
-        observations.labels[inside],
-        None if observations.intensity is None else observations.intensity[inside],
-        None if observations.has_intensity is None else observations.has_intensity[inside],
-    )
+    return observations.chosen(inside)
 
 
 def fuse_variants(
@@ -97,8 +94,9 @@ def fuse_variants(
     """
     reach = max(variant.ahead_m[1] for variant in variants)
     sweeps = GroundedSweeps(drive, config)
+    edges = next((v.range_edges_m for v in variants if v.range_edges_m), ())
     sources = {
-        tested: FrameSource(drive, _configured(config, tested, reach), sweeps)
+        tested: FrameSource(drive, _configured(config, tested, reach, edges), sweeps)
         for tested in sorted({variant.occlusion_test for variant in variants})
     }
     first = next(iter(sources.values()))
@@ -109,7 +107,12 @@ def fuse_variants(
 
     threshold = intensity_threshold(config, first, images, labels_of, segmenter.label_set)
     base = map_meta(config, drive, segmenter.label_set, segmenter.name, threshold)
-    metas = {v.name: base.model_copy(update={"count_mode": v.count_mode}) for v in variants}
+    metas = {
+        v.name: base.model_copy(
+            update={"count_mode": v.count_mode, "range_edges_m": v.range_edges_m}
+        )
+        for v in variants
+    }
     maps = {name: SemanticMap.create(folder / name, meta) for name, meta in metas.items()}
     segments = {name: CellCounts(meta) for name, meta in metas.items()}
     for number, (image, labels) in enumerate(
@@ -151,7 +154,9 @@ def _count_image(
         segments[variant.name].add(inside, frame_key(image))
 
 
-def _configured(config: Config, occlusion_test: bool, reach_m: float) -> Config:
+def _configured(
+    config: Config, occlusion_test: bool, reach_m: float, range_edges_m: tuple[float, ...]
+) -> Config:
     """All methods that lean on a sweep or a point map, as far as the furthest variant looks."""
     association = config.association.model_copy(
         update={
@@ -162,4 +167,5 @@ def _configured(config: Config, occlusion_test: bool, reach_m: float) -> Config:
             "lookup_range_m": max(reach_m, config.association.lookup_range_m),
         }
     )
-    return config.model_copy(update={"association": association})
+    fusion = config.fusion.model_copy(update={"range_edges_m": range_edges_m})
+    return config.model_copy(update={"association": association, "fusion": fusion})

@@ -8,13 +8,21 @@ from typing import Any, Final
 from hdmap_tools.evaluate.maps import FAR_M, MapVariant
 
 PAPER_MAP: Final = "clip"
-OUR_MAP: Final = "clip_visible"
+VISIBLE_MAP: Final = "clip_visible"
+OUR_MAP: Final = "clip_bands"
+
+RANGE_EDGES_M: Final = (6.0, 10.0)
+"""Bands of range in our map: a pixel at 10 m covers three times the ground that one at 6 m does."""
+
+CONFUSION_EDGES_M: Final = (0.0, *RANGE_EDGES_M, 15.0)
+"""Bands in which confusion is measured; what lies beyond the clip is not used with it."""
 
 CLIP: Final[tuple[MapVariant, ...]] = (
     MapVariant(PAPER_MAP, occlusion_test=False),
-    MapVariant(OUR_MAP),
+    MapVariant(VISIBLE_MAP),
+    MapVariant(OUR_MAP, range_edges_m=RANGE_EDGES_M),
 )
-"""The paper labels hidden points too; ours does not."""
+"""The paper labels hidden points too; ours does not, and keeps near and far votes apart."""
 
 COUNT_MODES: Final[tuple[MapVariant, ...]] = (
     MapVariant("clip_frame", occlusion_test=False, count_mode="frame"),
@@ -51,6 +59,7 @@ class Method:
         uses_priors: Whether the class shares of the calibration drive are the prior.
         uses_learned_intensity: Whether the likelihood learned on the calibration drive is used.
         uses_temperature: Whether the temperature fitted there is used.
+        uses_decision: Whether classes are decided for by the weights fitted there.
     """
 
     name: str
@@ -59,6 +68,7 @@ class Method:
     uses_priors: bool = False
     uses_learned_intensity: bool = False
     uses_temperature: bool = False
+    uses_decision: bool = False
 
 
 _PAPER: Final[dict[str, Any]] = {"other": False}
@@ -72,21 +82,25 @@ PAPER_METHODS: Final[tuple[Method, ...]] = (
 )
 """Source: Paz et al. 2020, table of results."""
 
+_ALL_LEARNED: Final[dict[str, bool]] = {
+    "uses_priors": True,
+    "uses_learned_intensity": True,
+    "uses_temperature": True,
+}
+
+OURS: Final = Method("ours", OUR_MAP, _OURS, **_ALL_LEARNED)
+
 OUR_METHODS: Final[tuple[Method, ...]] = (
-    Method("visible", OUR_MAP, _OURS),
+    Method("visible", VISIBLE_MAP, _OURS),
+    Method("+ bands", OUR_MAP, _OURS),
     Method("+ priors", OUR_MAP, _OURS, uses_priors=True),
     Method("+ intensity", OUR_MAP, _OURS, uses_priors=True, uses_learned_intensity=True),
-    Method(
-        "ours",
-        OUR_MAP,
-        _OURS,
-        uses_priors=True,
-        uses_learned_intensity=True,
-        uses_temperature=True,
-    ),
+    OURS,
+    Method("ours, decided", OUR_MAP, _OURS, **_ALL_LEARNED, uses_decision=True),
 )
-"""Occlusion test and the class ``other``; then, each on top of the one before, priors and
-intensity as learned on the calibration drive, and the temperature fitted there."""
+"""Occlusion test and the class ``other``; then, each on top of the one before, a confusion matrix
+by range, priors and intensity as learned on the calibration drive, the temperature fitted
+there (``ours``), and classes decided for as the calibration drive showed to be best."""
 
 MODE_METHODS: Final[tuple[Method, ...]] = (
     Method("CFN, count mode frame", "clip_frame", {**_PAPER, "model": "confusion"}),

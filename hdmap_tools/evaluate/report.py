@@ -47,6 +47,8 @@ class DriveEvaluation(BaseModel):
             the share of the road there that it knows.
         by_terrain: By method of association and part of the terrain.
         temperature: Fitted on the calibration drive.
+        decision: Weights of classes with which ``ours, decided`` decides, fitted there.
+        priors: Share of each class in what the calibration drive saw.
         reliability_before, reliability_after: Of our map, at temperature 1 and at that one.
         recall: Share of the true pixels of the calibration drives that the segmenter labels
             so, by map class.
@@ -68,6 +70,8 @@ class DriveEvaluation(BaseModel):
     by_range: dict[str, dict[str, PaperScores]]
     by_terrain: dict[str, dict[str, PaperScores]]
     temperature: float
+    decision: dict[str, float]
+    priors: dict[str, float]
     reliability_before: ReliabilityCurve
     reliability_after: ReliabilityCurve
     recall: dict[str, float]

@@ -94,8 +94,8 @@ class CellCounts:
 
         Raises:
             LabelError: If a label is outside the map's label set.
-            ShapeError: If a height is too far from the reference height, or a
-                point lies outside the lattice.
+            ShapeError: If a height is too far from the reference height, a point lies
+                outside the lattice, or a range is needed and missing.
         """
         self.num_frames += 1
         if len(observations) == 0:
@@ -120,6 +120,13 @@ class CellCounts:
         elif has_intensity is None:
             has_intensity = np.ones(len(observations), dtype=bool)
         bins = (has_intensity & (intensity >= self.meta.intensity_threshold)).astype(np.int64)
+        if self.meta.range_edges_m:
+            if observations.range_m is None:
+                raise ShapeError(
+                    f"The map counts bands of range from {self.meta.range_edges_m} m on, but the "
+                    "observations say no range."
+                )
+            bins += 2 * np.searchsorted(self.meta.range_edges_m, observations.range_m, side="right")
         votes = cast_votes(
             cells,
             observations.labels,

@@ -62,7 +62,7 @@ def learn_from_map(
     evidence, intensity = _cells_with_intensity(source, model, max_cells)
     share = np.exp(model.log_prior)
     seen: NDArrayFloat | float = 0.0
-    for done in range(1, max(rounds, 1) + 1):
+    for done in range(1, max(rounds, 1) + 1):  # noqa: B007  (told of below)
         with np.errstate(divide="ignore"):  # a class that cannot be told stays at 0
             belief = softmax(np.log(share)[:, None] + seen + evidence)
         before, share = share, belief.mean(axis=1)

@@ -25,7 +25,7 @@ from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.plugin_api import MapWindow
-from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayInt
 
 EXTENT_M: Final = (-10.0, -15.0, 30.0, 15.0)
 """(x0, y0, x1, y1) around the rear axle, x ahead, y left."""
@@ -100,7 +100,7 @@ class LocalMap:
             & (points[:, 1] > y0 - r) & (points[:, 1] < y1 + r)
         )  # fmt: skip
         seen = CellCounts(self.meta)
-        seen.add(_chosen(observations, inside, points), frame_key)
+        seen.add(replace(observations.chosen(inside), points_city=points[inside]), frame_key)
         self._held = combine_tiles(self._held, seen.window(self.grid), 1, (0, 0))
         return rolled
 
@@ -191,15 +191,3 @@ def _gathered(layer: NDArrayAny, at: NDArrayInt, inside: NDArrayBool) -> NDArray
     flat = layer.reshape(*shape[:-2], -1)
     taken = flat[..., np.where(inside, at[:, 0] * shape[-1] + at[:, 1], 0)]
     return np.where(inside, taken, 0).astype(layer.dtype).reshape(shape)
-
-
-def _chosen(observations: Observations, rows: NDArrayBool, points: NDArrayFloat) -> Observations:
-    """Some of the observations, with other points (N, 3)."""
-    intensity, has_intensity = observations.intensity, observations.has_intensity
-    return replace(
-        observations,
-        points_city=points[rows],
-        labels=observations.labels[rows],
-        intensity=None if intensity is None else intensity[rows],
-        has_intensity=None if has_intensity is None else has_intensity[rows],
-    )

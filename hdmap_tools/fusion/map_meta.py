@@ -6,13 +6,15 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from hdmap_tools.config import WholeMillimetres
+from hdmap_tools.config import RangeEdges, WholeMillimetres
 from hdmap_tools.errors import MapMismatchError
 from hdmap_tools.fusion.voting import CountMode, quanta_per_vote
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.labels.label_set import LabelSet
 
 MAP_SCHEMA_VERSION: Final = 1
+
+_MUST_AGREE: Final = {"resolution_m", "count_mode", "intensity_threshold", "range_edges_m", "model"}
 
 
 class MapMeta(BaseModel):
@@ -22,7 +24,9 @@ class MapMeta(BaseModel):
         resolution_m: Cell size, metres.
         label_set: What was counted: all the network's labels.
         count_mode: How a frame votes in a cell.
-        intensity_threshold: k; counts in bin 1 had intensity k or above, 0..255.
+        intensity_threshold: k; counts in odd bins had intensity k or above, 0..255.
+        range_edges_m: Distances from the camera at which a new band begins; counts of each
+            band are kept apart, because networks err more the further they look.
         reference_height_m: City height from which stored heights count.
         frame_document: The city frame (`MapFrame.to_json`).
         model: Name of the segmentation model; finds its confusion matrix on reading.
@@ -35,6 +39,7 @@ class MapMeta(BaseModel):
     label_set: LabelSet
     count_mode: CountMode
     intensity_threshold: Annotated[int, Field(ge=1, le=255)]
+    range_edges_m: RangeEdges = ()
     reference_height_m: WholeMillimetres = 0.0
     frame_document: dict[str, Any] = Field(default_factory=lambda: MapFrame().to_json())
     model: str = ""
@@ -46,8 +51,8 @@ class MapMeta(BaseModel):
 
     @property
     def num_bins(self) -> int:
-        """Intensity bins: below k, and k or above."""
-        return 2
+        """For each band of range two bins, nearest first: intensity below k, and k or above."""
+        return 2 * (len(self.range_edges_m) + 1)
 
     @property
     def quanta_per_vote(self) -> int:
@@ -61,12 +66,8 @@ class MapMeta(BaseModel):
             MapMismatchError: Naming each field that differs, with both values.
             CRSMismatchError: If the frames differ.
         """
-        mine = {"label_set": self.label_set.name} | self.model_dump(
-            include={"resolution_m", "count_mode", "intensity_threshold", "model"}
-        )
-        theirs = {"label_set": other.label_set.name} | other.model_dump(
-            include={"resolution_m", "count_mode", "intensity_threshold", "model"}
-        )
+        mine = {"label_set": self.label_set.name} | self.model_dump(include=_MUST_AGREE)
+        theirs = {"label_set": other.label_set.name} | other.model_dump(include=_MUST_AGREE)
         differing = [
             f"{key} {mine[key]!r} and {theirs[key]!r}" for key in mine if mine[key] != theirs[key]
         ]

@@ -12,6 +12,7 @@ what many frames repeat, and the mean is taken once.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass, replace
 from typing import Final
@@ -27,6 +28,9 @@ from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat
 
 _LOG = logging.getLogger(__name__)
+
+_MIN_PIXELS: Final = 1000
+"""A label seen on fewer pixels of a band says nothing of how the network sees it there."""
 
 OTHER: Final = "other"
 """The name of "none of the map's classes": buildings, vehicles, water, rails."""
@@ -142,6 +146,7 @@ def observation_model(
             )
     if kind == "vanilla":
         likelihood, can_tell = vanilla_likelihood(meta.label_set, names, config.vanilla_lambda)
+        by_band = [likelihood] * (meta.num_bins // 2)
     else:
         if confusion is None:
             raise ConfigError(
@@ -155,7 +160,11 @@ def observation_model(
                 f"({', '.join(confusion.predicted_set.names)}), but the map counted "
                 f"{meta.label_set.name!r} ({', '.join(meta.label_set.names)})."
             )
-        likelihood, can_tell = confusion_likelihood(confusion, names, config.smoothing)
+        _, can_tell = confusion_likelihood(confusion, names, config.smoothing)
+        by_band = [
+            confusion_likelihood(of_band, names, config.smoothing)[0]
+            for of_band in _matrices_of_bands(confusion, meta.range_edges_m)
+        ]
     untold = [
         name for name, told in zip(names, can_tell, strict=True) if not told and name != OTHER
     ]
@@ -165,9 +174,10 @@ def observation_model(
             meta.label_set.name,
             " or ".join(untold),
         )
-    log_likelihood = np.repeat(np.log(likelihood)[:, :, None], meta.num_bins, axis=2)
+    # Two bins of intensity a band, see `MapMeta.num_bins`.
+    log_likelihood = np.repeat(np.log(np.stack(by_band, axis=2)), 2, axis=2)
     if config.intensity == "gamma" and MapClass.LANE_MARK in names:
-        log_likelihood[names.index(MapClass.LANE_MARK), :, 1] += config.gamma
+        log_likelihood[names.index(MapClass.LANE_MARK), :, 1::2] += config.gamma
     model = ObservationModel(
         names,
         log_likelihood,
@@ -178,6 +188,26 @@ def observation_model(
         likelihood_of_intensity = IntensityLikelihood.load(config.intensity_likelihood)
         model = model.with_intensity(likelihood_of_intensity, config.intensity_weight)
     return model
+
+
+def _matrices_of_bands(
+    confusion: ConfusionMatrix, edges_m: tuple[float, ...]
+) -> list[ConfusionMatrix]:
+    """The matrix of each band of a map, nearest first; the whole one where range was not measured.
+
+    A band of the matrix belongs to the band of the map in which it begins (with a
+    millimetre to spare). A label that was hardly seen in a band is read with its whole row.
+    """
+    found = []
+    for low, high in itertools.pairwise([0.0, *edges_m, np.inf]):
+        counts = np.zeros_like(confusion.counts)
+        for band in confusion.bands:
+            if low <= band.min_m + 1e-3 < high:
+                counts = counts + band.counts
+        lacking = (counts.sum(axis=1) < _MIN_PIXELS) & (confusion.counts.sum(axis=1) > 0)
+        counts = np.where(lacking[:, None], confusion.counts, counts)
+        found.append(ConfusionMatrix(confusion.true_set, confusion.predicted_set, counts))
+    return found
 
 
 def vanilla_likelihood(

@@ -174,3 +174,22 @@ def test_a_point_without_intensity_is_no_sign_of_paint():
     assert layers["counts"][1, :, 0, :2].tolist() == [[0, 16], [16, 0]]
     assert layers["intensity_n"][0, :2].tolist() == [1, 0]
     assert layers["intensity_sum"][0, :2].tolist() == [200, 0]
+
+
+def test_bands_of_range_are_counted_apart():
+    plain = meta(intensity_threshold=100)
+    banded = plain.model_copy(update={"range_edges_m": (6.0, 10.0)})
+    points = np.zeros((4, 3)) + (0.05, 0.05, 0.0)
+    seen = Observations(
+        points,
+        np.array([1, 1, 1, 1], np.uint8),
+        np.array([0, 200, 200, 0], np.uint8),
+        range_m=np.array([5.9, 6.0, 9.9, 10.0]),
+    )
+    counts = CellCounts(banded.model_copy(update={"count_mode": "point"}))
+    counts.add(seen, 1)
+    assert counts.tiles[0, 0].layers["counts"][1, :, 0, 0].tolist() == [1, 0, 0, 2, 1, 0]
+    with pytest.raises(ShapeError, match="say no range"):
+        counts.add(Observations(points, seen.labels, seen.intensity), 2)
+    with pytest.raises(MapMismatchError, match="range_edges_m"):
+        CellCounts(plain).merge(CellCounts(banded))

@@ -13,7 +13,7 @@ from hdmap_tools.fusion.observation_model import (
     vanilla_likelihood,
 )
 from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass, load_label_set
-from hdmap_tools.segmentation.confusion import ConfusionMatrix
+from hdmap_tools.segmentation.confusion import ConfusionMatrix, RangeBand
 
 from .builders import ADAS, meta
 
@@ -241,3 +241,39 @@ def test_a_matrix_for_other_labels_is_refused():
     other = ConfusionMatrix(ADAS, CITYSCAPES, np.ones((4, 19), dtype=np.int64), "")
     with pytest.raises(LabelError, match=r"predicts 'cityscapes'.*counted 'adas-0001'"):
         observation_model(ObservationConfig(model="confusion"), meta(), MAP_CLASSES, other)
+
+
+def test_each_band_of_range_is_read_with_its_own_matrix():
+    near = np.full((len(CITYSCAPES), len(ADAS)), 1000)
+    far = near.copy()
+    near[:, 0], far[:, 1] = 9000, 9000
+    bands = (RangeBand(0.0, 6.0, near), RangeBand(6.0, np.inf, far))
+    whole = ConfusionMatrix(CITYSCAPES, ADAS, near + far, "drawn", bands)
+    config = ObservationConfig(model="confusion", intensity="gamma", gamma=0.7)
+    apart = observation_model(config, meta(range_edges_m=(6.0,)), MAP_CLASSES, whole)
+    one = [
+        observation_model(config, meta(), MAP_CLASSES, ConfusionMatrix(CITYSCAPES, ADAS, counts))
+        for counts in (near, far)
+    ]
+    np.testing.assert_allclose(apart.log_likelihood[:, :, :2], one[0].log_likelihood)
+    np.testing.assert_allclose(apart.log_likelihood[:, :, 2:], one[1].log_likelihood)
+    assert not np.allclose(apart.log_likelihood[:, :, :2], apart.log_likelihood[:, :, 2:])
+    # A matrix without bands is read the same at any range.
+    bare = observation_model(
+        config, meta(range_edges_m=(6.0,)), MAP_CLASSES, ConfusionMatrix(CITYSCAPES, ADAS, near)
+    )
+    np.testing.assert_allclose(bare.log_likelihood[:, :, :2], bare.log_likelihood[:, :, 2:])
+
+
+def test_a_label_hardly_seen_in_a_band_is_read_with_its_whole_row():
+    near = np.full((len(CITYSCAPES), len(ADAS)), 1000)
+    far = near.copy()
+    road = CITYSCAPES.id_of("road")
+    far[road] = [3, 0, 0, 0]
+    bands = (RangeBand(0.0, 6.0, near), RangeBand(6.0, np.inf, far))
+    whole = ConfusionMatrix(CITYSCAPES, ADAS, near + far, "drawn", bands)
+    model = observation_model(
+        ObservationConfig(model="confusion"), meta(range_edges_m=(6.0,)), MAP_CLASSES, whole
+    )
+    row = model.log_likelihood[NAMES.index("road"), :, 2]
+    assert np.ptp(row) < 0.01  # three pixels do not make a network that always errs
