@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
-from hdmap_tools.compare.reference import Reference, load_reference
+from hdmap_tools.compare.reference import Reference, load_references
 from hdmap_tools.config import Config
 from hdmap_tools.errors import FormatError
 from hdmap_tools.formats.by_name import write_vector_map
@@ -205,12 +205,13 @@ def compare_with_reference(
 ) -> dict[str, tuple[Reference, RasterComparison]]:
     """Hold each method's map against the reference, if there is one."""
     path = config.compare.reference
+    if path is None:
+        return {}
     compared = {}
-    for method, window in windows.items() if path is not None else ():
-        assert path is not None
-        reference = load_reference(path, window.grid)
+    references = load_references(path, {method: one.grid for method, one in windows.items()})
+    for method, reference in references.items():
         comparison = compare_raster(
-            window,
+            windows[method],
             reference,
             path_xy=drive.trajectory.translations[:, :2],
             max_range_m=config.compare.max_range_m,

@@ -148,13 +148,14 @@ def compare_raster(
                 f"visible must be bool of the grid's shape {window.grid.shape}, found {np.shape(visible)}."
             )
         in_range &= np.asarray(visible, dtype=bool)
-    has_evidence = np.isfinite(window.dataset["posterior"].values).all(axis=0)
+    posterior = window.dataset["posterior"].values
+    has_evidence = np.isfinite(posterior).all(axis=0)
     is_filled = has_evidence & ~(window.layer("observations") > 0)
     if not count_filled:
         has_evidence &= ~is_filled
     compared = in_range & has_evidence
     not_observed = in_range & ~has_evidence
-    best = np.nan_to_num(window.dataset["posterior"].values, nan=-1.0).argmax(axis=0)
+    best = posterior[:, compared].argmax(axis=0)
     cell_m2 = window.grid.resolution_m**2
     groups = {
         group.name: _score(group, window.classes, best, compared, not_observed, cell_m2)
@@ -207,13 +208,11 @@ def cells_in_range(
             f"max_range_m needs a positive range and at least one finite path point, found "
             f"{max_range_m} m and {len(path)} points."
         )
-    from scipy.spatial import cKDTree
+    from hdmap_tools.compare.range_kernels import mark_near
 
-    xs, ys = np.meshgrid(grid.x_centres_m, grid.y_centres_m)
-    distance, _ = cKDTree(path).query(
-        np.column_stack([xs.ravel(), ys.ravel()]), distance_upper_bound=max_range_m * (1 + 1e-9)
+    return np.asarray(
+        mark_near(grid.x_centres_m, grid.y_centres_m, path, max_range_m * (1 + 1e-9)) > 0
     )
-    return np.asarray(np.isfinite(distance).reshape(grid.shape))
 
 
 def predicted_cells(window: MapWindow, group: ReferenceGroup) -> NDArrayBool:
@@ -241,7 +240,7 @@ def _score(
     not_observed: NDArrayBool,
     cell_m2: float,
 ) -> GroupScore:
-    predicted = _in_group(group, classes, best)[compared]
+    predicted = _in_group(group, classes, best)
     truth = group.truth[compared]
     tp = int((predicted & truth).sum())
     fp = int((predicted & ~truth).sum())

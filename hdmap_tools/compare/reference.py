@@ -7,7 +7,7 @@ behind it compares cells with cells.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -115,7 +115,7 @@ def load_reference(
         FormatError: If the file cannot be read, or does not overlap the grid.
         CRSMismatchError: If its place relative to the map cannot be known.
     """
-    if path.is_dir() and (path / "index.json").is_file():
+    if _is_truth_raster(path):
         from hdmap_tools.compare.truth_reference import reference_from_truth_raster
 
         return reference_from_truth_raster(path, grid)
@@ -139,6 +139,26 @@ def load_reference(
         min_share=min_share,
         assume_same_frame=assume_same_frame,
     )
+
+
+def load_references(path: Path, grids: Mapping[str, BevGrid]) -> dict[str, Reference]:
+    """`load_reference` for several maps of one lattice, by name.
+
+    A truth raster, which takes the longest, is read once for all.
+
+    Raises:
+        HDMapError: As `load_reference`.
+    """
+    if grids and _is_truth_raster(path):
+        from hdmap_tools.compare.truth_reference import references_from_truth_raster
+
+        made = references_from_truth_raster(path, list(grids.values()))
+        return dict(zip(grids, made, strict=True))
+    return {name: load_reference(path, grid) for name, grid in grids.items()}
+
+
+def _is_truth_raster(path: Path) -> bool:
+    return path.is_dir() and (path / "index.json").is_file()
 
 
 def reference_from_mask(

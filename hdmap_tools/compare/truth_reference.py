@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 
-from hdmap_tools.compare.paper import PAINT_SHARE, describe_paint_rule, true_classes
+from hdmap_tools.compare.paper import NO_TRUTH, PAINT_SHARE, describe_paint_rule, true_classes
 from hdmap_tools.compare.reference import (
     DRIVABLE_GROUP,
     SHARE_TOLERANCE,
@@ -19,14 +21,22 @@ from hdmap_tools.errors import FormatError
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, MAP_CLASSES
 from hdmap_tools.simulate.truth_raster import TruthRaster
-from hdmap_tools.types import NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat
 
 
 def true_shares(raster: TruthRaster, grid: BevGrid) -> NDArrayFloat:
     """(class, y, x) share of each cell that each map class covers; NaN where not all of it is known."""
-    shares = raster.class_fractions(grid, MAP_CLASSES).astype(np.float64)
-    shares[:, raster.known_fraction(grid) < 1.0 - SHARE_TOLERANCE] = np.nan
+    covered, known_shares = _covered(raster, grid)
+    shares = np.full((len(MAP_CLASSES), *grid.shape), np.nan)
+    shares[:, covered] = known_shares
     return shares
+
+
+def _covered(raster: TruthRaster, grid: BevGrid) -> tuple[NDArrayBool, NDArrayFloat]:
+    """(y, x) which cells are wholly known, and (class, N) the shares of those."""
+    shares, known = raster.shares(grid, MAP_CLASSES)
+    covered = np.asarray(known >= 1.0 - SHARE_TOLERANCE)
+    return covered, shares[:, covered].astype(np.float64)
 
 
 def reference_from_truth_raster(
@@ -44,17 +54,55 @@ def reference_from_truth_raster(
         CRSMismatchError: If it is of another frame.
         MapMismatchError: If the resolution does not fit.
     """
+    [reference] = references_from_truth_raster(folder, [grid], paint_share=paint_share)
+    return reference
+
+
+def references_from_truth_raster(
+    folder: Path, grids: Sequence[BevGrid], *, paint_share: float = PAINT_SHARE
+) -> list[Reference]:
+    """The same for several grids of one lattice, for which the truth is read once.
+
+    Args:
+        folder: ``truth/raster`` of a simulated drive.
+        grids: The cells of each map, at least one.
+        paint_share: See `true_classes`.
+
+    Raises:
+        HDMapError: As `reference_from_truth_raster`, and if the grids differ in resolution.
+    """
     raster = TruthRaster.open(folder)
     source = f"truth of {folder.absolute().parent.parent.name}"
-    frame_relation(raster.frame, grid.frame, source)
-    shares = true_shares(raster, grid)
-    covered = np.asarray(np.isfinite(shares).all(axis=0))
-    if not covered.any():
-        raise FormatError(str(no_overlap(source, raster.bounds_m, grid)))
-    index = true_classes(shares, [str(c) for c in MAP_CLASSES], paint_share)
+    whole = reduce(BevGrid.union, grids)
+    frame_relation(raster.frame, whole.frame, source)
+    covered, shares = _covered(raster, whole)
+    index = np.full(whole.shape, NO_TRUTH, dtype=np.int8)
+    index[covered] = true_classes(shares[:, None], [str(c) for c in MAP_CLASSES], paint_share)[0]
+    references = []
+    for grid in grids:
+        part = (
+            slice(grid.y_min - whole.y_min, grid.y_max - whole.y_min),
+            slice(grid.x_min - whole.x_min, grid.x_max - whole.x_min),
+        )
+        if not covered[part].any():
+            raise FormatError(str(no_overlap(source, raster.bounds_m, grid)))
+        references.append(
+            Reference(
+                grid,
+                _groups(index[part]),
+                covered[part].copy(),
+                source,
+                describe_paint_rule(paint_share),
+            )
+        )
+    return references
+
+
+def _groups(index: NDArrayAny) -> tuple[ReferenceGroup, ...]:
+    """Each class, and the drivable ones, of true classes (y, x)."""
     groups = [
         ReferenceGroup(str(c), (c,), np.asarray(index == k)) for k, c in enumerate(MAP_CLASSES)
     ]
-    drivable = [MAP_CLASSES.index(c) for c in DRIVABLE_CLASSES]
-    groups.append(ReferenceGroup(DRIVABLE_GROUP, DRIVABLE_CLASSES, np.isin(index, drivable)))
-    return Reference(grid, tuple(groups), covered, source, describe_paint_rule(paint_share))
+    of_class = {group.name: group.truth for group in groups}
+    drivable = np.logical_or.reduce([of_class[str(c)] for c in DRIVABLE_CLASSES])
+    return (*groups, ReferenceGroup(DRIVABLE_GROUP, DRIVABLE_CLASSES, drivable))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from hdmap_tools.types import NDArrayAny, NDArrayByte
@@ -21,9 +22,17 @@ def count_into(
         col: The same along the other axis.
         n: Fine cells a coarse one, along each axis.
     """
-    for r in range(codes.shape[0]):
-        y = (row + r) // n
-        for c in range(codes.shape[1]):
-            kind = kinds[codes[r, c]]
-            if kind < counts.shape[0]:
-                counts[kind, y, (col + c) // n] += 1
+    height, width = codes.shape
+    # One block after another: its counts stay at hand, and nothing is divided in the inmost loop.
+    of_kind = np.zeros(256, dtype=np.int32)
+    for y in range(row // n, (row + height - 1) // n + 1):
+        first_row, last_row = max(y * n - row, 0), min((y + 1) * n - row, height)
+        for x in range(col // n, (col + width - 1) // n + 1):
+            first_col, last_col = max(x * n - col, 0), min((x + 1) * n - col, width)
+            for r in range(first_row, last_row):
+                for c in range(first_col, last_col):
+                    of_kind[kinds[codes[r, c]]] += 1
+            for kind in range(counts.shape[0]):
+                counts[kind, y, x] += of_kind[kind]
+                of_kind[kind] = 0
+            of_kind[255] = 0

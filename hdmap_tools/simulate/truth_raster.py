@@ -20,7 +20,7 @@ from hdmap_tools.labels.label_set import IGNORE_ID, MAP_CLASSES, MapClass, load_
 from hdmap_tools.simulate.materials import Mat
 from hdmap_tools.simulate.scene import label_ids_by_material
 from hdmap_tools.simulate.surface import CELL_M, TILE_CELLS, TILE_M, block_of_tile
-from hdmap_tools.types import NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
 if TYPE_CHECKING:
     from hdmap_tools.simulate.build_scene import SceneBuilder
@@ -238,21 +238,36 @@ class TruthRaster:
         Raises:
             MapMismatchError: If the resolution is none, or the frame another one.
         """
-        kinds = np.full(256, 255, dtype=np.uint8)
+        return self.shares(grid, classes)[0]
+
+    def shares(
+        self, grid: BevGrid, classes: Sequence[MapClass] = MAP_CLASSES
+    ) -> tuple[NDArrayFloat32, NDArrayFloat32]:
+        """`class_fractions` (class, y, x) and `known_fraction` (y, x), read in one pass.
+
+        Args:
+            grid: Of any resolution that is a whole number of 2 cm cells.
+            classes: Which classes, in the order of the result.
+
+        Raises:
+            MapMismatchError: If the resolution is none, or the frame another one.
+        """
+        # The last kind is known ground that is none of the classes.
+        kinds = np.full(256, len(classes), dtype=np.uint8)
+        kinds[0] = 255
         for k, map_class in enumerate(classes):
             ids = self.label_set.ids_of_class(MapClass(map_class))
             kinds[1:][np.isin(self._label_ids[1:], ids)] = k
-        return self._share(grid, kinds, len(classes))
+        counts, block = self._counts(grid, kinds, len(classes) + 1)
+        known = counts.sum(axis=0, dtype=np.int32)
+        return _share(counts[:-1], block), _share(known, block)
 
     def known_fraction(self, grid: BevGrid) -> NDArrayFloat32:
         """(y, x) float32 share of each cell of a grid that the truth covers."""
-        kinds = np.zeros(256, dtype=np.uint8)
-        kinds[0] = 255
-        share: NDArrayFloat32 = self._share(grid, kinds, 1)[0]
-        return share
+        return self.shares(grid, ())[1]
 
-    def _share(self, grid: BevGrid, kinds: NDArrayByte, count: int) -> NDArrayFloat32:
-        """Share of cells of each kind in each cell of a grid, counted tile by tile."""
+    def _counts(self, grid: BevGrid, kinds: NDArrayByte, count: int) -> tuple[NDArrayAny, int]:
+        """(kind, y, x) int32 cells of each kind in each of a grid's, and how many one holds."""
         from hdmap_tools.simulate.truth_kernels import count_into
 
         n = round(grid.resolution_m / CELL_M)
@@ -273,8 +288,7 @@ class TruthRaster:
                 x0 - ix * TILE_CELLS : x1 - ix * TILE_CELLS,
             ]
             count_into(counts, codes, kinds, y0 - grid.y_min * n, x0 - grid.x_min * n, n)
-        share: NDArrayFloat32 = (counts / np.float32(n * n)).astype(np.float32)
-        return share
+        return counts, n * n
 
     def _by_tile(self, tiles: NDArrayInt) -> list[tuple[tuple[int, int], NDArrayInt]]:
         """Tiles that there are, each with which of the points (N, 2) of tile numbers are its."""
@@ -317,6 +331,11 @@ class TruthRaster:
                 "simulate the drive again."
             )
         return nodes
+
+
+def _share(counts: NDArrayAny, block: int) -> NDArrayFloat32:
+    share: NDArrayFloat32 = (counts / np.float32(block)).astype(np.float32)
+    return share
 
 
 def _remember(

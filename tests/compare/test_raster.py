@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.spatial import cKDTree
 from shapely.geometry import box
 
 from hdmap_tools.compare.raster import RasterComparison, cells_in_range, compare_raster
@@ -130,6 +131,21 @@ def test_range_counts_from_points_in_three_dimensions_too() -> None:
     expected[3, 2:5] = True
     expected[2:5, 3] = True
     np.testing.assert_array_equal(near, expected)
+
+
+@pytest.mark.parametrize("reach_m", [0.2, 1.0, 7.3, 500.0])
+def test_cells_in_range_are_those_that_a_tree_of_the_path_finds(reach_m: float) -> None:
+    grid = BevGrid(0.1, -57, 300, 113, 417)
+    rng = np.random.default_rng(0)
+    path = np.cumsum(rng.normal(0.03, 0.2, (40, 2)), axis=0) + (0.0, 35.0)
+    path = np.concatenate([path, np.round(path, 1) + 0.05])  # also exactly on centres
+    centres = np.stack(np.meshgrid(grid.x_centres_m, grid.y_centres_m), axis=-1)
+    distance, _ = cKDTree(path).query(
+        centres.reshape(-1, 2), distance_upper_bound=reach_m * (1 + 1e-9)
+    )
+    expected = np.isfinite(distance).reshape(grid.shape)
+    np.testing.assert_array_equal(cells_in_range(grid, path, reach_m), expected)
+    assert expected.any()
 
 
 def test_filled_cells_are_counted_or_left_out() -> None:

@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 import shapely
 
+from hdmap_tools.compare.paper import true_classes
+from hdmap_tools.compare.truth_reference import (
+    reference_from_truth_raster,
+    references_from_truth_raster,
+    true_shares,
+)
 from hdmap_tools.errors import CRSMismatchError, FormatError, MapMismatchError
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.geometry.map_frame import MapFrame
-from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass, load_label_set
+from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, MAP_CLASSES, MapClass, load_label_set
 from hdmap_tools.map_model.elements import (
     BoundaryKind,
     Crosswalk,
@@ -21,6 +27,7 @@ from hdmap_tools.simulate.build_scene import SceneBuilder
 from hdmap_tools.simulate.materials import MATERIALS, Mat
 from hdmap_tools.simulate.route import Route
 from hdmap_tools.simulate.settings import SimulationSettings
+from hdmap_tools.simulate.truth_kernels import count_into
 from hdmap_tools.simulate.truth_raster import TruthRaster, write_truth_raster
 from hdmap_tools.simulate.truth_vectors import truth_vector_map
 from tests.simulate.small_worlds import LANE_M, bend, curved_street, street_route
@@ -108,6 +115,49 @@ def test_fractions_do_not_depend_on_the_grid_s_bounds(truth: TruthRaster) -> Non
     np.testing.assert_array_equal(part, whole[:, 183:290, 167:241])
     known = truth.known_fraction(large)
     assert (whole.sum(axis=0) <= known + 1e-6).all()
+
+
+def test_one_pass_gives_what_counting_each_cell_gives() -> None:
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 6, (37, 52)).astype(np.uint8)
+    kinds = np.full(256, 255, dtype=np.uint8)
+    kinds[1:5] = [2, 0, 1, 7]  # 7 is none of the three, 255 neither
+    for n, row, col in ((1, 0, 0), (5, 3, 11), (7, 20, 0), (100, 40, 30)):
+        counts = np.ones((3, (row + 37) // n + 1, (col + 52) // n + 1), dtype=np.int32)
+        expected = counts.copy()
+        r, c = np.indices(codes.shape)
+        for kind in range(3):
+            is_kind = kinds[codes] == kind
+            np.add.at(expected[kind], ((r[is_kind] + row) // n, (c[is_kind] + col) // n), 1)
+        count_into(counts, codes, kinds, row, col, n)
+        np.testing.assert_array_equal(counts, expected)
+
+
+def test_several_grids_have_the_same_truth_as_each_alone(folder: Path) -> None:
+    x, y = np.floor(bend(np.array([90.0]), 0.0)[0]).astype(int) * 5
+    grids = [
+        BevGrid(0.2, x - 120, y - 90, x + 60, y + 70),
+        BevGrid(0.2, x - 33, y - 17, x + 200, y + 150),
+    ]
+    together = references_from_truth_raster(folder, grids)
+    truth = TruthRaster.open(folder)
+    for grid, reference in zip(grids, together, strict=True):
+        alone = reference_from_truth_raster(folder, grid)
+        shares = truth.class_fractions(grid).astype(np.float64)
+        shares[:, truth.known_fraction(grid) < 1.0 - 1e-6] = np.nan
+        np.testing.assert_array_equal(true_shares(truth, grid), shares)
+        index = true_classes(shares, [str(c) for c in MAP_CLASSES])
+        for one in (alone, reference):
+            np.testing.assert_array_equal(one.is_covered, np.isfinite(shares[0]))
+            for k, map_class in enumerate(MAP_CLASSES):
+                np.testing.assert_array_equal(one.group(map_class).truth, index == k)
+            drivable = np.isin(index, [MAP_CLASSES.index(c) for c in DRIVABLE_CLASSES])
+            np.testing.assert_array_equal(one.group("drivable").truth, drivable)
+            assert one.source == alone.source
+    assert not together[1].is_covered.all()
+    far = BevGrid(0.2, x + 10_000, y, x + 10_010, y + 10)
+    with pytest.raises(FormatError, match="does not overlap"):
+        references_from_truth_raster(folder, [grids[0], far])
 
 
 def test_fractions_of_another_lattice_or_frame_are_refused(truth: TruthRaster) -> None:
