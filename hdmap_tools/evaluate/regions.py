@@ -25,29 +25,30 @@ _STEP_M: Final = 1.0
 def passed_mask(
     grid: BevGrid, poses: Iterable[SE3], ahead_m: tuple[float, float], across_m: float
 ) -> NDArrayBool:
-    """(y, x) bool: cells that lay in the clip of any pose.
+    """(y, x) bool: cells whose centres lay in the clip of any pose.
 
     Args:
         grid: Cells.
         poses: ``city_SE3_ego`` of the frames.
-        ahead_m: Of the clip, in the ego frame.
+        ahead_m: Of the clip, in the ego frame: beyond the first, up to the second.
         across_m: Of the clip, to either side.
     """
-    import cv2
-
-    mask = np.zeros(grid.shape, dtype=np.uint8)
-    corners = np.array(
-        [
-            [ahead_m[0], -across_m, 0.0],
-            [ahead_m[1], -across_m, 0.0],
-            [ahead_m[1], across_m, 0.0],
-            [ahead_m[0], across_m, 0.0],
-        ]
-    )
+    mask = np.zeros(grid.shape, dtype=bool)
+    x, y = grid.x_centres_m, grid.y_centres_m
+    corners = np.array([[a, b, 0.0] for a in ahead_m for b in (-across_m, across_m)])
     for pose in poses:
-        cells = grid.to_grid(pose.transform_from(corners)[:, :2])[:, ::-1]
-        cv2.fillConvexPoly(mask, np.rint(cells * 16).astype(np.int32), 1, shift=4)
-    return mask.astype(bool)
+        # A filled polygon of OpenCV takes its outline's pixels too: half a cell too many all round.
+        at = np.clip(grid.to_grid(pose.transform_from(corners)[:, :2]), 0, grid.shape)
+        rows, cols = (
+            slice(int(low), int(high) + 2) for low, high in zip(at.min(0), at.max(0), strict=True)
+        )
+        dx, dy = x[None, cols] - pose.translation[0], y[rows, None] - pose.translation[1]
+        (a, b), (c, d) = np.linalg.inv(pose.rotation[:2, :2])
+        ahead, left = a * dx + b * dy, c * dx + d * dy
+        mask[rows, cols] |= (
+            (ahead > ahead_m[0]) & (ahead <= ahead_m[1]) & (np.abs(left) <= across_m)
+        )
+    return mask
 
 
 def terrain_masks(
