@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter, OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
-from hdmap_tools.fusion.cell_counts import TILE_CELLS, Tile, TileIndex
+from hdmap_tools.fusion.cell_counts import TILE_CELLS, Tile, TileIndex, window_of_tiles
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.observation_model import ObservationModel
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.plugin_api import MapWindow
-from hdmap_tools.types import NDArrayAny, NDArrayFloat
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayInt
+
+_TILES_IN_MEMORY: Final = 24
+"""Of 19 labels and two bins, 240 MB of counts."""
 
 
 class HasCounts(Protocol):
@@ -55,6 +59,7 @@ def read_window(
         "intensity": np.full(grid.shape, np.nan, dtype=np.float32),
         "height": np.full(grid.shape, np.nan, dtype=np.float32),
     }
+    source = _RecentTiles(source)
     for block in blocks_with_evidence(source.tile_indices(), grid, fill_radius_cells):
         rows = slice(block.y_min - grid.y_min, block.y_max - grid.y_min)
         cols = slice(block.x_min - grid.x_min, block.x_max - grid.x_min)
@@ -91,10 +96,18 @@ def _read_block(
 ) -> tuple[NDArrayFloat, dict[str, NDArrayAny]]:
     """Posterior (class, y, x) and the other layers (y, x) of one block."""
     read = read_counts(source, block, radius)
-    posterior = model.posterior(read.counts, read.mean_intensity)
+    # Most of a map is unknown: only cells with counts are put through the model.
+    rows, cols = np.nonzero((read.counts > 0).any(axis=(0, 1)))
+    posterior = np.full((len(model.classes), *block.shape), np.nan)
+    entropy = np.full(block.shape, np.nan)
+    if len(rows):
+        known = model.posterior(
+            read.counts[:, :, rows, cols][..., None], read.mean_intensity[rows, cols][:, None]
+        )[..., 0]
+        posterior[:, rows, cols] = known
+        # A probability of 0 adds nothing, and its logarithm would be infinite.
+        entropy[rows, cols] = -(known * np.log(np.where(known > 0, known, 1.0))).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        entropy = -np.where(posterior > 0, posterior * np.log(posterior), 0.0).sum(axis=0)
-        entropy[np.isnan(posterior[0])] = np.nan
         height = read.layers["height_sum"] / read.layers["height_n"] / 1000.0
     votes = read.layers["counts"].sum(axis=(0, 1), dtype=np.float64) / source.meta.quanta_per_vote
     return posterior, {
@@ -103,6 +116,41 @@ def _read_block(
         "intensity": mean_intensity_of(read.layers),
         "height": height + source.meta.reference_height_m,
     }
+
+
+class _RecentTiles:
+    """A source whose tiles are read once, though each block asks for its neighbours' edges."""
+
+    def __init__(self, source: HasCounts) -> None:
+        self.meta = source.meta
+        self._source = source
+        self._present = frozenset(source.tile_indices())
+        # Blocks come column by column, so the columns before and behind are still wanted.
+        columns = Counter(x for x, _ in self._present)
+        self._most = min(3 * max(columns.values(), default=0), _TILES_IN_MEMORY)
+        self._recent: OrderedDict[TileIndex, Tile] = OrderedDict()
+
+    def tile_indices(self) -> tuple[TileIndex, ...]:
+        """As the source."""
+        return tuple(sorted(self._present))
+
+    def window(self, grid: BevGrid) -> Tile:
+        """As the source."""
+        return window_of_tiles(self._tile, grid, self.meta)
+
+    def _tile(self, index: TileIndex) -> Tile | None:
+        if index not in self._present:
+            return None
+        if index not in self._recent:
+            x, y = index[0] * TILE_CELLS, index[1] * TILE_CELLS
+            grid = BevGrid(
+                self.meta.resolution_m, x, y, x + TILE_CELLS, y + TILE_CELLS, self.meta.frame
+            )
+            self._recent[index] = self._source.window(grid)
+        self._recent.move_to_end(index)
+        while len(self._recent) > max(self._most, 1):
+            self._recent.popitem(last=False)
+        return self._recent[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +174,29 @@ def read_counts(source: HasCounts, block: BevGrid, radius: int = 0) -> ReadCount
     layers = source.window(block.expand(radius)).layers
     counts, intensity = layers["counts"], mean_intensity_of(layers)
     if radius > 0:
-        unknown = ~counts.any(axis=(0, 1))
-        if not unknown.all() and unknown.any():
-            counts = np.where(unknown, box_mean(counts, radius), counts)
-            intensity = np.where(unknown, _box_mean_of_known(intensity, radius), intensity)
+        observed = np.asarray(counts.any(axis=(0, 1)))
         inner = (..., slice(radius, -radius), slice(radius, -radius))
-        counts, intensity = counts[inner], intensity[inner]
-        layers = {name: layer[inner] for name, layer in layers.items()}
+        rows, cols = _unknown_near(observed, radius)
+        inside = counts[inner]
+        if len(rows):
+            inside = inside.astype(np.float64)
+            at = (rows - radius, cols - radius)
+            inside[:, :, *at] = box_mean_at(counts, observed, radius, rows, cols)
+            filled = intensity[inner].copy()
+            filled[at] = _box_mean_of_known_at(intensity, radius, rows, cols)
+            intensity = filled
+        else:
+            intensity = intensity[inner]
+        counts, layers = inside, {name: layer[inner] for name, layer in layers.items()}
     return ReadCounts(counts, intensity, layers)
+
+
+def _unknown_near(observed: NDArrayBool, radius: int) -> tuple[NDArrayInt, NDArrayInt]:
+    """Cells further than the radius from the edge that are unknown, with a known one in their box."""
+    rows, cols = np.nonzero(~observed[radius:-radius, radius:-radius])
+    rows, cols = rows + radius, cols + radius
+    near = _box_sums(observed[None], radius, rows, cols)[0] > 0
+    return rows[near], cols[near]
 
 
 def mean_intensity_of(layers: dict[str, NDArrayAny]) -> NDArrayFloat:
@@ -142,32 +205,46 @@ def mean_intensity_of(layers: dict[str, NDArrayAny]) -> NDArrayFloat:
         return np.asarray(layers["intensity_sum"] / layers["intensity_n"])
 
 
-def _box_mean_of_known(values: NDArrayFloat, radius: int) -> NDArrayFloat:
-    """Mean of the numbers in a box around each cell (y, x); NaN where there are none."""
+def _box_mean_of_known_at(
+    values: NDArrayFloat, radius: int, rows: NDArrayInt, cols: NDArrayInt
+) -> NDArrayFloat:
+    """Mean of the numbers in a box around cells (N,) of values (y, x); NaN where there are none."""
     known = np.isfinite(values)
-    as_counts = np.stack([known, np.where(known, values, 0.0)])
-    number, total = box_mean(as_counts[:, None].astype(np.float64), radius)[:, 0]
+    number, total = _box_sums(np.stack([known, np.where(known, values, 0.0)]), radius, rows, cols)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(number > 0.0, total / number, np.nan))
+        return np.asarray(np.where(number > 0.0, total.clip(min=0.0) / number, np.nan))
 
 
-def box_mean(counts: NDArrayAny, radius: int) -> NDArrayFloat:
-    """Mean counts of the observed cells in a box around each cell; zeros where there are none.
+def box_mean_at(
+    counts: NDArrayAny, observed: NDArrayBool, radius: int, rows: NDArrayInt, cols: NDArrayInt
+) -> NDArrayFloat:
+    """(label, bin, N) mean counts of the observed cells in a box around some cells.
 
     Args:
-        counts: (label, bin, y, x).
+        counts: (label, bin, y, x) whole numbers.
+        observed: (y, x) cells with any count.
         radius: Half the box, cells; 1 is the paper's 3 x 3 kernel.
+        rows: With
+        cols: (N,) cells whose box lies in the array and holds an observed one.
     """
-    from scipy.ndimage import uniform_filter
-
-    size = 2 * radius + 1
-    observed = counts.any(axis=(0, 1)).astype(np.float64)
-    share = uniform_filter(observed, size, mode="constant")
     channels = counts.reshape(-1, *counts.shape[2:])
-    sums = np.stack(
-        [uniform_filter(channel.astype(np.float64), size, mode="constant") for channel in channels]
-    )
-    sums = sums.reshape(counts.shape)
-    # Below half a cell of the box the filter's rounding is all there is.
-    there = share > 0.5 / size**2
-    return np.where(there, sums / np.where(there, share, 1.0), 0.0).clip(min=0.0)
+    used = np.flatnonzero(channels.any(axis=(1, 2)))
+    mean = np.zeros((len(channels), len(rows)))
+    sums = _box_sums(channels[used], radius, rows, cols)
+    mean[used] = sums / _box_sums(observed[None], radius, rows, cols)
+    return mean.reshape(*counts.shape[:2], -1)
+
+
+def _box_sums(values: NDArrayAny, radius: int, rows: NDArrayInt, cols: NDArrayInt) -> NDArrayFloat:
+    """(K, N) sums of values (K, y, x) over a box around cells, by running sums; exact for whole numbers."""
+    height, width = values.shape[1:]
+    sums = np.empty((len(values), len(rows)))
+    running = np.zeros((height + 1, width + 1))
+    top, left = rows - radius, cols - radius
+    bottom, right = rows + radius + 1, cols + radius + 1
+    for k, one in enumerate(values):
+        np.cumsum(one, axis=0, dtype=np.float64, out=running[1:, 1:])
+        np.cumsum(running[1:, 1:], axis=1, out=running[1:, 1:])
+        sums[k] = running[bottom, right] - running[top, right]
+        sums[k] -= running[bottom, left] - running[top, left]
+    return sums

@@ -1,11 +1,14 @@
+from collections import Counter
+
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter
 
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.config import ObservationConfig
 from hdmap_tools.fusion.cell_counts import TILE_CELLS, CellCounts
 from hdmap_tools.fusion.observation_model import observation_model
-from hdmap_tools.fusion.read_window import box_mean, read_window
+from hdmap_tools.fusion.read_window import box_mean_at, read_counts, read_window
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.labels.label_set import MAP_CLASSES
 
@@ -109,13 +112,77 @@ def test_filling_sees_beyond_the_window():
     assert window.is_known[:, 5].tolist() == [True, True, True, False]
 
 
+def box_mean(counts, radius):
+    """The plain form: mean counts of the observed cells in a box around each cell."""
+    size = 2 * radius + 1
+    observed = counts.any(axis=(0, 1)).astype(np.float64)
+    share = uniform_filter(observed, size, mode="constant")
+    channels = counts.reshape(-1, *counts.shape[2:]).astype(np.float64)
+    sums = np.stack([uniform_filter(one, size, mode="constant") for one in channels])
+    there = share > 0.5 / size**2
+    return np.where(there, sums.reshape(counts.shape) / np.where(there, share, 1.0), 0.0)
+
+
 def test_box_mean_is_the_mean_over_observed_cells_of_the_box():
     counts = np.zeros((1, 1, 5, 5))
     counts[0, 0, 1, 1], counts[0, 0, 1, 2] = 6.0, 2.0
-    mean = box_mean(counts, 1)[0, 0]
-    assert mean[0, 0] == pytest.approx(6.0)
-    assert mean[2, 2] == pytest.approx(4.0)
-    assert mean[4, 4] == 0.0
+    observed = counts[0, 0] > 0
+    found = box_mean_at(counts, observed, 1, np.array([2, 1]), np.array([2, 3]))
+    assert found[0, 0].tolist() == [4.0, 2.0]
+
+
+@pytest.mark.parametrize("radius", [1, 2, 7])
+def test_filling_some_cells_equals_filtering_all(radius):
+    rng = np.random.default_rng(radius)
+    counts = CellCounts(meta())
+    cells = np.unique(rng.integers(0, 60, (300, 2)) * (4, 1), axis=0)
+    # Huge counts beside small ones: running sums must not lose the small.
+    for _ in range(4):
+        some = cells[rng.random(len(cells)) < 0.6]
+        counts.add(seen(some, rng.integers(0, 4, len(some)), intensity=rng.integers(0, 255)), 0)
+    counts.tiles[(0, 0)].layers["counts"][:, :, 3] *= 2**26
+    block = BevGrid(0.2, 0, 0, 256, 256)
+    read = read_counts(counts, block, radius)
+    layers = counts.window(block.expand(radius)).layers
+    unknown = ~layers["counts"].any(axis=(0, 1))
+    inner = (..., slice(radius, -radius), slice(radius, -radius))
+    expected = np.where(unknown, box_mean(layers["counts"], radius), layers["counts"])[inner]
+    np.testing.assert_allclose(read.counts, expected, rtol=1e-9, atol=1e-6)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        intensity = layers["intensity_sum"] / layers["intensity_n"]
+    known = np.isfinite(intensity)
+    both = np.stack([known, np.where(known, intensity, 0.0)])[:, None]
+    number, total = box_mean(both, radius)[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        filled = np.where(number > 0, total / number, np.nan)
+    expected = np.where(unknown, filled, intensity)[inner]
+    np.testing.assert_allclose(read.mean_intensity, expected, rtol=1e-9)
+    assert np.isfinite(expected).sum() > known.sum() > 100
+
+
+class CountingSource:
+    """A map that says how often each tile was read."""
+
+    def __init__(self, counts):
+        self.meta, self._counts, self.read = counts.meta, counts, Counter()
+
+    def tile_indices(self):
+        return self._counts.tile_indices()
+
+    def window(self, grid):
+        first, last = grid.x_min // TILE_CELLS, (grid.x_max - 1) // TILE_CELLS
+        self.read.update((x, grid.y_min // TILE_CELLS) for x in range(first, last + 1))
+        return self._counts.window(grid)
+
+
+def test_a_tile_is_read_once_though_its_neighbours_want_its_edge():
+    counts = CellCounts(meta())
+    places = [(x * TILE_CELLS, y * TILE_CELLS) for x in range(3) for y in range(2)]
+    counts.add(seen(places, [1] * 6), 0)
+    source = CountingSource(counts)
+    read_window(source, counts.grid, model(counts.meta), 1)
+    assert set(source.read.values()) == {1}
+    assert len(source.read) == 6
 
 
 def test_a_window_is_read_only():
