@@ -7,6 +7,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 PYTEST := $(BIN)/python -m pytest
 ARGS   ?=
+DEMO   ?= demo
 
 # A changed PYTHONPATH or user site would let other packages into the tests.
 export PYTHONNOUSERSITE = 1
@@ -14,7 +15,7 @@ unexport PYTHONPATH
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help venv test test-slow test-all lint lint-format lint-rules lint-types format bench schemas clean
+.PHONY: help venv demo test test-slow test-all lint lint-format lint-rules lint-types format bench schemas clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -42,6 +43,9 @@ $(READY): pyproject.toml constraints.txt
 	@# av2 lacks dependencies on purpose (see pyproject.toml), nothing else may.
 	@! $(BIN)/python -m pip check | grep -v -e '^av2 ' -e '^No broken'
 	@touch $@
+
+demo: $(READY) ## Simulate a drive, map it, hold the map against the truth; DEMO=folder
+	$(BIN)/hdmap demo -o $(DEMO) --overwrite
 
 test: $(READY) ## Run all tests but the slow ones
 	$(PYTEST) $(ARGS)
