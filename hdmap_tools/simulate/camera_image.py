@@ -78,6 +78,14 @@ def render_image(
     )
 
 
+def prepare_textures(caster: RayCaster) -> GroundTexture:
+    """The ground's texture of a scene, made once; else its first image makes it."""
+    texture = _textures.get(caster)
+    if texture is None:
+        texture = _textures[caster] = ground_texture(caster.scene.surface)
+    return texture
+
+
 def camera_rays(caster: RayCaster, camera: PinholeCamera, city_SE3_ego: SE3) -> NDArrayFloat32:
     """Rays (h * w, 6) float32 through the pixel centres, row by row, from the scene's origin.
 
@@ -117,9 +125,7 @@ def _shaded(
     from hdmap_tools.simulate.compiled import in_bands
     from hdmap_tools.simulate.shading import shade
 
-    texture = _textures.get(caster)
-    if texture is None:
-        texture = _textures[caster] = ground_texture(caster.scene.surface)
+    texture = prepare_textures(caster)
     answers, amplitudes = _answers()
     sunlight = _sunlight(caster, camera, rays, hits, light, time_s)
     open_sky = _open_sky(caster, camera, rays, hits, light, time_s)

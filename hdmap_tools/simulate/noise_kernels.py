@@ -1,19 +1,37 @@
-"""Value noise of city coordinates: the same place has the same grain from wherever it is seen."""
+"""Value noise of city coordinates: the same place has the same grain from wherever it is seen.
+
+All hashes are counted in 32 bits, which wrap: eight of them fit a vector register, so that
+the corners of a lattice cell are hashed at once.
+"""
 
 from __future__ import annotations
 
 from math import floor
+from typing import Any
+
+import numpy as np
 
 from hdmap_tools.simulate.compiled import compiled_fast
+
+_X, _Y, _Z = np.uint32(374761393), np.uint32(668265263), np.uint32(2147483647)
+_FIRST, _SECOND = np.uint32(1274126177), np.uint32(1103515245)
+_13, _15, _16 = np.uint32(13), np.uint32(15), np.uint32(16)
+_24_BITS = np.uint32(0xFFFFFF)
+
+
+@compiled_fast
+def _unit(h: Any) -> float:
+    """A number in 0..1 that follows from 32 bits and looks random."""
+    h = np.uint32(np.uint32(h ^ (h >> _13)) * _FIRST)
+    h = np.uint32(np.uint32(h ^ (h >> _15)) * _SECOND)
+    # By way of a signed number, for which processors have an instruction.
+    return float(np.int32((h ^ (h >> _16)) & _24_BITS)) * (1.0 / 16777216.0)
 
 
 @compiled_fast
 def hash_unit(x: int, y: int, z: int) -> float:
     """A number in 0..1 that follows from three integers and looks random."""
-    h = (x * 374761393 + y * 668265263 + z * 2147483647) & 0xFFFFFFFF
-    h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
-    h = ((h ^ (h >> 15)) * 1103515245) & 0xFFFFFFFF
-    return ((h ^ (h >> 16)) & 0xFFFFFF) / 16777216.0
+    return _unit(np.uint32(np.uint32(x) * _X + np.uint32(y) * _Y + np.uint32(z) * _Z))
 
 
 @compiled_fast
@@ -21,13 +39,15 @@ def noise2(x: float, y: float, seed: int) -> float:
     """Smooth noise of the plane in -1..1, its lattice at whole numbers."""
     fx, fy = floor(x), floor(y)
     u, v = x - fx, y - fy
-    ix, iy = int(fx), int(fy)
+    corner = np.uint32(
+        np.uint32(np.int64(fx)) * _X + np.uint32(np.int64(fy)) * _Y + np.uint32(seed) * _Z
+    )
     u = u * u * (3.0 - 2.0 * u)
     v = v * v * (3.0 - 2.0 * v)
-    a = hash_unit(ix, iy, seed)
-    b = hash_unit(ix + 1, iy, seed)
-    c = hash_unit(ix, iy + 1, seed)
-    d = hash_unit(ix + 1, iy + 1, seed)
+    a = _unit(corner)
+    b = _unit(np.uint32(corner + _X))
+    c = _unit(np.uint32(corner + _Y))
+    d = _unit(np.uint32(np.uint32(corner + _X) + _Y))
     return 2.0 * ((a + (b - a) * u) * (1.0 - v) + (c + (d - c) * u) * v) - 1.0
 
 

@@ -5,7 +5,9 @@ All sensors see the scene through this; open3d's ``RaycastingScene`` (Embree) do
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +19,9 @@ from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayByte, NDArrayFloat
 
 ACTOR_RANGE_M: Final = 250.0
 """Actors further than this from the first ray's origin are left out."""
+
+_KEPT_TIMES: Final = 8
+"""Instants whose actors are kept; more than there are threads that ask."""
 
 SHADOW_START_M: Final = 0.02
 """Shadow rays start this far from the surface, or float32 hits it again."""
@@ -54,7 +59,7 @@ class _PlacedActors:
 
 
 class RayCaster:
-    """A scene that rays can be cast into; it is built once and serves all sensors.
+    """A scene that rays can be cast into; it is built once and serves all sensors and threads.
 
     Args:
         scene: What is there. Static meshes are indexed once, actors anew for each time.
@@ -73,7 +78,8 @@ class RayCaster:
             ]
         )
         self._spheres = [_bounding_sphere(actor.mesh) for actor in scene.actors]
-        self._placed: tuple[float, _PlacedActors | None] | None = None
+        self._placed: OrderedDict[float, _PlacedActors | None] = OrderedDict()
+        self._placing = Lock()
 
     @property
     def raster_frame(self) -> NDArrayFloat:
@@ -194,10 +200,16 @@ class RayCaster:
     def actors_at(self, time_s: float, near: NDArrayAny) -> _PlacedActors | None:
         """The actors within `ACTOR_RANGE_M` of a point, from the scene's origin; None without any.
 
-        Kept for the time last asked for: all cameras and the shadows of one instant share it.
+        Kept for the times last asked for: all cameras and the shadows of one instant share it.
         """
-        if self._placed is not None and self._placed[0] == time_s:
-            return self._placed[1]
+        with self._placing:
+            if time_s not in self._placed:
+                self._placed[time_s] = self._place(time_s, near)
+                if len(self._placed) > _KEPT_TIMES:
+                    self._placed.popitem(last=False)
+            return self._placed[time_s]
+
+    def _place(self, time_s: float, near: NDArrayAny) -> _PlacedActors | None:
         meshes: list[Mesh] = []
         spheres: list[tuple[float, ...]] = []
         for actor, (centre, radius) in zip(self.scene.actors, self._spheres, strict=True):
@@ -218,7 +230,6 @@ class RayCaster:
             placed = _PlacedActors(
                 _indexed(merged), merged.materials, np.array(spheres, dtype=np.float32)
             )
-        self._placed = (time_s, placed)
         return placed
 
 
@@ -230,6 +241,8 @@ def _indexed(mesh: Mesh) -> Any:
             o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.vertices, np.float32)),
             o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.triangles, np.uint32)),
         )
+        # The index is built for the first ray, which two threads must not both be.
+        caster.cast_rays(o3d.core.Tensor.from_numpy(np.ones((1, 6), np.float32)))
     return caster
 
 

@@ -9,6 +9,9 @@ import numpy as np
 from hdmap_tools.simulate.compiled import compiled
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32
 
+_BUNDLE = 32
+"""Rays that are looked at as one."""
+
 _GROUND = 0
 _GRASS = 13
 _SKY = 255
@@ -102,24 +105,73 @@ def near_spheres(
     spheres: NDArrayFloat32,
     is_near: NDArrayAny,
 ) -> None:
-    """Which rays pass through a sphere before they hit; spheres (K, 4) are centre and radius."""
-    for i in range(first, last):
-        is_near[i] = False
-        dx, dy, dz = rays[i, 3], rays[i, 4], rays[i, 5]
-        length2 = dx * dx + dy * dy + dz * dz
-        reach = t[i]
-        for k in range(len(spheres)):
-            x = spheres[k, 0] - rays[i, 0]
-            y = spheres[k, 1] - rays[i, 1]
-            z = spheres[k, 2] - rays[i, 2]
-            along = x * dx + y * dy + z * dz
-            gap2 = x * x + y * y + z * z
-            radius = spheres[k, 3]
-            # Squared distance of the centre from the ray, times length2.
-            if gap2 * length2 - along * along > radius * radius * length2:
+    """Which rays pass through a sphere before they hit; spheres (K, 4) are centre and radius.
+
+    Neighbouring rays are alike: most spheres are far from all of a bundle of them, and are
+    left out for the bundle.
+    """
+    around = np.empty(len(spheres), np.int64)
+    for begin in range(first, last, _BUNDLE):
+        end = min(begin + _BUNDLE, last)
+        count = _spheres_around(begin, end, rays, spheres, around)
+        for i in range(begin, end):
+            is_near[i] = False
+            if count == 0:
                 continue
-            if along < 0 and gap2 > radius * radius:
-                continue
-            if along - radius * sqrt(length2) < reach * length2:
-                is_near[i] = True
-                break
+            dx, dy, dz = rays[i, 3], rays[i, 4], rays[i, 5]
+            length2 = dx * dx + dy * dy + dz * dz
+            reach = t[i]
+            for n in range(count):
+                k = around[n]
+                x = spheres[k, 0] - rays[i, 0]
+                y = spheres[k, 1] - rays[i, 1]
+                z = spheres[k, 2] - rays[i, 2]
+                along = x * dx + y * dy + z * dz
+                gap2 = x * x + y * y + z * z
+                radius = spheres[k, 3]
+                # Squared distance of the centre from the ray, times length2.
+                if gap2 * length2 - along * along > radius * radius * length2:
+                    continue
+                if along < 0 and gap2 > radius * radius:
+                    continue
+                if along - radius * sqrt(length2) < reach * length2:
+                    is_near[i] = True
+                    break
+
+
+@compiled
+def _spheres_around(
+    begin: int, end: int, rays: NDArrayFloat32, spheres: NDArrayFloat32, around: NDArrayAny
+) -> int:
+    """How many spheres a bundle may meet, and into `around` which.
+
+    The rays begin within `spread` of the middle one's origin, and their unit directions are
+    within `bend` of its own: where they come near a sphere they are within ``spread + bend *
+    distance`` of its line.
+    """
+    middle = (begin + end) // 2
+    ox, oy, oz = float(rays[middle, 0]), float(rays[middle, 1]), float(rays[middle, 2])
+    dx, dy, dz = float(rays[middle, 3]), float(rays[middle, 4]), float(rays[middle, 5])
+    length = sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / length, dy / length, dz / length
+    spread2 = bend2 = 0.0
+    for i in range(begin, end):
+        x, y, z = rays[i, 0] - ox, rays[i, 1] - oy, rays[i, 2] - oz
+        spread2 = max(spread2, x * x + y * y + z * z)
+        x, y, z = float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5])
+        scale = 1.0 / sqrt(x * x + y * y + z * z)
+        x, y, z = x * scale - dx, y * scale - dy, z * scale - dz
+        bend2 = max(bend2, x * x + y * y + z * z)
+    spread, bend = sqrt(spread2), sqrt(bend2)
+    count = 0
+    for k in range(len(spheres)):
+        x, y, z = spheres[k, 0] - ox, spheres[k, 1] - oy, spheres[k, 2] - oz
+        gap2 = x * x + y * y + z * z
+        gap = sqrt(gap2)
+        along = x * dx + y * dy + z * dz
+        # A ray is as far along as the sphere's far side, at most; a millimetre for rounding.
+        wide = spheres[k, 3] + spread + bend * (gap + spread + spheres[k, 3]) + 1e-3
+        if gap <= wide or (along > 0.0 and gap2 - along * along <= wide * wide):
+            around[count] = k
+            count += 1
+    return count

@@ -1,6 +1,7 @@
 """A whole small drive, judged by the data set's own package, by its own truth, and by its bytes."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from hdmap_tools.readers.image import read_image
 from hdmap_tools.segmentation.label_png import read_label_png
 from hdmap_tools.segmentation.precomputed import PrecomputedSegmenter
 from hdmap_tools.simulate import drive as drive_module
+from hdmap_tools.simulate import recorder as recorder_module
 from hdmap_tools.simulate.drive import simulate_drive
 from hdmap_tools.simulate.drive_plan import plan_drive, planned_shots
 from hdmap_tools.simulate.read_world import read_world, shipped_world
@@ -271,14 +273,60 @@ def test_the_vehicle_keeps_to_the_limits_of_a_vehicle():
 
 
 @pytest.mark.slow
-def test_nothing_is_left_when_it_fails_on_the_way(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("module", "function"),
+    [
+        (recorder_module.write_log, "write_jpeg"),
+        (recorder_module.truth_files, "write_true_labels"),
+        (drive_module, "write_truth_raster"),
+        (recorder_module, "RayCaster"),
+    ],
+)
+def test_nothing_is_left_when_any_thread_fails_on_the_way(tmp_path, monkeypatch, module, function):
     def broken(*_args, **_options):
         raise RuntimeError("the disk is full")
 
-    monkeypatch.setattr(drive_module.write_log, "write_jpeg", broken)
+    monkeypatch.setattr(module, function, broken)
     with pytest.raises(RuntimeError, match="disk is full"):
         simulate_drive(shipped_world(), tmp_path / "log", TINY)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_building_of_the_true_map_ends_when_recording_fails(tmp_path, monkeypatch):
+    reported = []
+
+    def endless(*_args, progress):
+        while len(reported) < 10_000:
+            time.sleep(0.01)
+            reported.append(len(reported))
+            progress(len(reported), 10_000)
+
+    def broken(*_args):
+        raise RuntimeError("the disk is full")
+
+    monkeypatch.setattr(drive_module, "write_truth_raster", endless)
+    monkeypatch.setattr(recorder_module.write_log, "write_jpeg", broken)
+    with pytest.raises(RuntimeError, match="disk is full"):
+        simulate_drive(shipped_world(), tmp_path / "log", TINY)
+    assert len(reported) < 10_000
+
+
+@pytest.mark.slow
+def test_progress_rises_to_all_there_is(tmp_path):
+    told = []
+    drive = simulate_drive(
+        shipped_world(), tmp_path / "log", TINY, progress=lambda *told_now: told.append(told_now)
+    )
+    files = {
+        "images": list(drive.glob("sensors/cameras/*/*.jpg")),
+        "sweeps": list(drive.glob("sensors/lidar/*.feather")),
+        "tiles": list(drive.glob("truth/raster/*.npy")),
+    }
+    for what, written in files.items():
+        steps = [(done, total) for name, done, total in told if name == what]
+        assert steps == sorted(steps)
+        assert steps[-1] == (len(written), len(written))
 
 
 def test_what_exists_is_replaced_only_when_asked(tmp_path, simulated_drive):

@@ -1,6 +1,7 @@
 """Rays against analytic shapes."""
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -92,3 +93,52 @@ def test_the_house_and_the_car_keep_the_sun_off(caster: RayCaster) -> None:
 def test_directions_of_the_wrong_shape_are_refused(caster: RayCaster) -> None:
     with pytest.raises(ShapeError, match=r"\(N, 3\)"):
         caster.cast(ORIGIN, np.zeros(3), 0.0)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.003, 0.3, 3.0])
+@pytest.mark.parametrize("spread", [0.0, 0.5, 20.0])
+def test_no_sphere_that_a_ray_meets_is_left_out_for_its_bundle(width: float, spread: float) -> None:
+    from hdmap_tools.simulate.ray_kernels import near_spheres
+
+    rng = np.random.default_rng(3)
+    count = 5000
+    rays = np.empty((count, 6), np.float32)
+    rays[:, :3] = rng.normal(0, 1, 3) * 10 + rng.uniform(-spread, spread, (count, 3))
+    drift = np.cumsum(rng.normal(0, 0.01, (count, 3)), axis=0)
+    rays[:, 3:] = (1.0, 0.2, 0.1) + drift + rng.normal(0, width, (count, 3))
+    reach = rng.choice(np.array([3.0, 40.0, np.inf], np.float32), count)
+    spheres = np.column_stack([rng.uniform(-60, 60, (60, 3)), rng.uniform(0.5, 6, 60)])
+    spheres = spheres.astype(np.float32)
+
+    origins, directions = rays[:, :3].astype(np.float64), rays[:, 3:].astype(np.float64)
+    lengths = np.linalg.norm(directions, axis=1)
+    to_centre = spheres[None, :, :3] - origins[:, None]
+    along = np.einsum("nkd,nd->nk", to_centre, directions / lengths[:, None])
+    # From the nearest point of the ray as far as it reaches, not of its line.
+    within = np.clip(along, 0.0, (reach * lengths)[:, None])
+    within = np.where(np.isfinite(within), within, 0.0)
+    nearest = within[..., None] * (directions / lengths[:, None])[:, None]
+    meets = (np.linalg.norm(to_centre - nearest, axis=2) < spheres[:, 3] * 0.999).any(axis=1)
+
+    found = np.empty(count, np.bool_)
+    near_spheres(0, count, rays, reach, spheres, found)
+    assert 50 < meets.sum() < count  # there is something to leave out, and to find
+    assert found[meets].all()
+    line = to_centre - along[..., None] * (directions / lengths[:, None])[:, None]
+    passes = (np.linalg.norm(line, axis=2) < spheres[:, 3] * 1.001).any(axis=1)
+    assert not found[~passes].any()
+
+
+def test_actors_are_the_same_for_many_threads_at_many_times(caster: RayCaster) -> None:
+    directions = np.column_stack([np.cos(a := np.linspace(0, 6, 3000)), np.sin(a), -0.1 + 0 * a])
+    times = np.linspace(0.0, 4.0, 40)
+
+    def look(time_s: float) -> bytes:
+        hits = caster.cast(ORIGIN + (0.0, 0.0, 1.5), directions, time_s)
+        return hits.t.tobytes() + hits.material.tobytes() + hits.on_actor.tobytes()
+
+    expected = [look(t) for t in times]
+    assert len(set(expected)) > 3
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(3):
+            assert list(pool.map(look, times)) == expected
