@@ -42,20 +42,19 @@ def cell_centres_around(
     Those within reach and, seen from above, within the camera's view and a margin;
     which of them the image really holds, the projection says.
     """
+    from hdmap_tools.association.lookup_kernels import centres_in_view
+
     centre = camera_position(camera, city_SE3_ego)[:2]
-    middle = np.floor(centre / resolution_m)
-    reach = np.arange(-(reach_m // resolution_m) - 1, reach_m // resolution_m + 2)
-    steps = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
-    xy = (middle + steps + 0.5) * resolution_m
-    distance = np.linalg.norm(xy - centre, axis=1)
-    near = (distance <= reach_m) & (distance >= min_range_m)
-    return np.asarray(xy[near & _may_be_in_view(xy - centre, camera, city_SE3_ego)])
+    axis, widest = _view(camera, city_SE3_ego)
+    found: NDArrayFloat = centres_in_view(centre, resolution_m, reach_m, min_range_m, axis, widest)
+    return found
 
 
-def _may_be_in_view(
-    offset_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3
-) -> NDArrayBool:
-    """Which horizontal directions (N, 2) from a camera may meet its image; errs towards yes."""
+def _view(camera: PinholeCamera, city_SE3_ego: SE3) -> tuple[NDArrayFloat, float]:
+    """Axis (2,) and cosine of half the angle of the horizontal directions that may meet an image.
+
+    Errs towards more; -2 where any direction may be seen.
+    """
     u = np.linspace(0, camera.width_px - 1, 9)
     v = np.linspace(0, camera.height_px - 1, 9)
     border = np.concatenate(
@@ -66,11 +65,9 @@ def _may_be_in_view(
     axis = (city_SE3_ego.rotation @ camera.ego_SE3_cam.rotation)[:2, 2]
     flat = np.linalg.norm(rays[:, :2], axis=1)
     if not np.isfinite(rays).all() or np.linalg.norm(axis) < 0.5 or (flat < 0.2).any():
-        return np.ones(len(offset_city), dtype=bool)  # looks up or down: any direction may be seen
+        return np.array([1.0, 0.0]), -2.0  # looks up or down
     axis = axis / np.linalg.norm(axis)
-    widest = float((rays[:, :2] @ axis / flat).min()) - 0.05
-    forward = offset_city @ axis
-    return np.asarray(forward >= widest * np.linalg.norm(offset_city, axis=1))
+    return axis, float((rays[:, :2] @ axis / flat).min()) - 0.05
 
 
 def project_city(points_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3) -> Projection:

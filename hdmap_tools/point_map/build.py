@@ -240,12 +240,15 @@ def _intensity_response(
     statistics = IntensityStatistics()
     for ref in refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]:
         seen = sweep_in_city(posed, ref, config)
-        distance, _ = path.query(seen.points_city[:, :2], distance_upper_bound=_ASPHALT_FROM_PATH_M)
+        ground = seen.is_ground
+        distance, _ = path.query(
+            seen.points_city[ground, :2], distance_upper_bound=_ASPHALT_FROM_PATH_M
+        )
         statistics.add(
-            seen.sweep.intensity,
-            seen.sweep.ring,
-            np.linalg.norm(seen.sweep.points_ego, axis=1),
-            seen.is_ground & np.isfinite(distance),
+            seen.sweep.intensity[ground],
+            seen.sweep.ring[ground],
+            np.linalg.norm(seen.sweep.points_ego[ground], axis=1),
+            np.isfinite(distance),
         )
     response = statistics.response()
     if response is None:
