@@ -31,7 +31,7 @@ MAP: Final = "map"
 @options.overwrite_option
 @click.pass_context
 def command(ctx: click.Context, /, out: Path, length_m: float, seed: int, overwrite: bool) -> int:
-    """Simulate a drive through a made-up town, map it, and compare the map with the truth.
+    """Simulate a short drive, map it, and hold the map against the truth.
 
     \b
     Examples:

@@ -11,7 +11,7 @@ from hdmap_tools.cli.simulation import SimulationProgressBars, settings_of, worl
 
 
 @click.command()
-@click.argument("world", type=options.PATH)
+@click.argument("worlds", metavar="WORLD...", nargs=-1, required=True, type=options.PATH)
 @click.option("-o", "--out", type=options.PATH, required=True, help="Folder to make.")
 @click.option(
     "--preset", type=click.Choice(["paz2020"]), default="paz2020", help="Experiment to repeat."
@@ -25,6 +25,7 @@ from hdmap_tools.cli.simulation import SimulationProgressBars, settings_of, worl
 @click.option(
     "--length-m", type=float, help="Length of the simulated drive [default: the preset's]."
 )
+@click.option("--start", help="Lane id, or X,Y, where the simulated drive starts.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the simulated drives.")
 @click.option(
     "--difficulty", type=click.Choice(["easy", "default", "hard"]), help="Of the simulated drives."
@@ -37,7 +38,7 @@ from hdmap_tools.cli.simulation import SimulationProgressBars, settings_of, worl
 @options.config_options
 @click.pass_context
 def command(ctx: click.Context, /, **given: Any) -> None:
-    """Measure the paper's four methods and ours against exact truth.
+    """Measure the paper's methods and ours on simulated drives with exact truth.
 
     \b
     Examples:
@@ -45,12 +46,12 @@ def command(ctx: click.Context, /, **given: Any) -> None:
       hdmap evaluate map.osm -o evaluated --model road-segmentation-adas-0001.xml
       hdmap evaluate drive -o evaluated --calibration other_drive
 
-    WORLD is a map to simulate drives in (as for `hdmap simulate`) or a simulated drive.
-    Labels come from --model, by default from the simulated network, whose confusion is
+    WORLD is a map to simulate drives in (as for `hdmap simulate`) or a simulated drive; of
+    several the figures over all their cells are printed too. Labels come from --model, by default from the simulated network, whose confusion is
     measured on other drives than the evaluated one. OUT holds the tables (evaluation.txt,
     .json, .csv), the measured confusion matrix and pictures.
     """
-    from hdmap_tools.evaluate.run import PRESETS, evaluate
+    from hdmap_tools.evaluate.run import PRESETS, evaluate_all, pooled_text
     from hdmap_tools.steps import Steps
 
     preset = PRESETS[given["preset"]]
@@ -63,7 +64,8 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     settings = settings_of(
         {
             "seed": given["seed"],
-            "length_m": given["length_m"] or preset.length_m,
+            "length_m": preset.length_m if given["length_m"] is None else given["length_m"],
+            "start": given["start"],
             "difficulty": given["difficulty"],
             "pose_errors": {"noise_m": given["pose_noise_m"], "noise_deg": given["pose_noise_deg"]},
         },
@@ -72,8 +74,8 @@ def command(ctx: click.Context, /, **given: Any) -> None:
         options.ImageProgress(ctx.obj["progress"]) as segmented,
         SimulationProgressBars(ctx.obj["progress"]) as simulated,
     ):
-        evaluation = evaluate(
-            world_path(given["world"]),
+        evaluations = evaluate_all(
+            [world_path(world) for world in given["worlds"]],
             given["out"],
             config,
             preset,
@@ -84,5 +86,8 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             steps=Steps(segmented),
             progress=simulated,
         )
-    click.echo(evaluation.to_text())
+    for evaluation in evaluations:
+        click.echo(evaluation.to_text())
+    if len(evaluations) > 1:
+        click.echo(pooled_text(evaluations))
     click.echo(f"Pictures and tables are in {given['out']}.")

@@ -222,6 +222,33 @@ def paper_scores(
     )
 
 
+def pooled_scores(scores: Sequence[PaperScores]) -> PaperScores:
+    """The measures over the cells of several maps together; at least one."""
+    classes = {}
+    for name in scores[0].classes:
+        each = [one.classes[name] for one in scores]
+        classes[name] = _from_counts(
+            sum(s.true_positives for s in each),
+            sum(s.false_positives for s in each),
+            sum(s.false_negatives for s in each),
+        )
+    # Coverage is of the truth's drivable cells; those are found or missed by some class.
+    weights = [
+        sum(s.true_positives + s.false_negatives for s in one.classes.values()) for one in scores
+    ]
+    known = sum(w * (one.coverage or 0.0) for w, one in zip(weights, scores, strict=True))
+    return PaperScores(
+        classes=classes,
+        miou=_mean([s.iou for s in classes.values()]),
+        mean_accuracy=_mean([s.accuracy for s in classes.values()]),
+        coverage=known / sum(weights) if sum(weights) else None,
+        num_cells=sum(one.num_cells for one in scores),
+        num_unknown=sum(one.num_unknown for one in scores),
+        paint_share=scores[0].paint_share,
+        truth_rule=scores[0].truth_rule,
+    )
+
+
 def describe_paint_rule(paint_share: float) -> str:
     """When a cell is lane mark, in words."""
     if paint_share == ANY_PAINT:
@@ -262,6 +289,10 @@ def _score(predicted: NDArrayBool, truth: NDArrayBool) -> ClassScore:
     tp = int((predicted & truth).sum())
     fp = int((predicted & ~truth).sum())
     fn = int((~predicted & truth).sum())
+    return _from_counts(tp, fp, fn)
+
+
+def _from_counts(tp: int, fp: int, fn: int) -> ClassScore:
     return ClassScore(
         iou=_ratio(tp, tp + fp + fn),
         accuracy=_ratio(tp, tp + fn),

@@ -94,9 +94,19 @@ class Evaluated:
 
 
 @dataclass(frozen=True, eq=False)
-class _Learned:
-    """What the calibration drives taught."""
+class Learned:
+    """What the calibration drives taught.
 
+    Attributes:
+        drive_ids: Of the drives.
+        confusion: By range, over all of them.
+        intensity: What each class looks like, on the first.
+        priors: Share of each class, and of ``other``, in what the first saw.
+        temperature: Fitted on the first.
+        decision: Weights of classes that do best on the first.
+    """
+
+    drive_ids: tuple[str, ...]
     confusion: ConfusionMatrix
     intensity: IntensityLikelihood
     priors: dict[str, float]
@@ -106,7 +116,7 @@ class _Learned:
 
 def evaluate_drive(
     drive_path: Path,
-    calibration_paths: Sequence[Path],
+    learned: Learned,
     scratch: Path,
     config: Config,
     *,
@@ -117,31 +127,22 @@ def evaluate_drive(
 
     Args:
         drive_path: The drive to be evaluated, simulated.
-        calibration_paths: Other simulated drives: on all of them the confusion matrix is
-            measured, on the first also what classes look like in intensity, and the temperature.
+        learned: From other drives (`learn`).
         scratch: Folder for point maps and semantic maps; exists.
         config: Cell size, segmentation, point map; methods and observation models are set here.
         cache: Where label images are kept.
         steps: Told of progress.
 
     Raises:
-        ConfigError: If a drive has no truth, or the evaluated one is among the others.
+        ConfigError: If the drive has no truth, or taught what it is to be evaluated with.
     """
     steps = steps or Steps()
-    if not calibration_paths:
-        raise ConfigError(
-            "An evaluation needs another drive on which confusion, intensity and temperature are "
-            "measured; give one, or a world in which one can be simulated."
-        )
     drive = open_configured(config, drive_path)
-    others = [open_configured(config, path) for path in calibration_paths]
-    for one in (drive, *others):
-        TruthOfDrive.of(one)
-    if drive.id in {other.id for other in others}:
+    TruthOfDrive.of(drive)
+    if drive.id in learned.drive_ids:
         raise ConfigError(
             f"Drive {drive.name} cannot be evaluated with what was measured on itself."
         )
-    learned = _learn(others, scratch, config, cache, steps)
     segmenter = open_segmenter(config.segmentation, drive)
     config, drive = _with_points(config, drive, scratch / "evaluated", steps)
     with steps.timed("fuse"):
@@ -155,16 +156,39 @@ def evaluate_drive(
             steps,
         )
     with steps.timed("score"):
-        return _scored(drive, config, maps, learned, others, segmenter.name, steps)
+        return _scored(drive, config, maps, learned, segmenter.name, steps)
 
 
-def _learn(
-    others: Sequence[Drive],
+def learn(
+    calibration_paths: Sequence[Path],
     scratch: Path,
     config: Config,
-    cache: LabelCache | None,
-    steps: Steps,
-) -> _Learned:
+    *,
+    cache: LabelCache | None = None,
+    steps: Steps | None = None,
+) -> Learned:
+    """Measure confusion, priors, intensity, temperature and decision on simulated drives.
+
+    Args:
+        calibration_paths: Drives: on all of them the confusion matrix is measured, on the
+            first also the rest.
+        scratch: Folder for point maps and semantic maps; exists.
+        config: As for `evaluate_drive`.
+        cache: Where label images are kept.
+        steps: Told of progress.
+
+    Raises:
+        ConfigError: If there is no drive, or one has no truth.
+    """
+    steps = steps or Steps()
+    if not calibration_paths:
+        raise ConfigError(
+            "An evaluation needs another drive on which confusion, intensity and temperature are "
+            "measured; give one, or a world in which one can be simulated."
+        )
+    others = [open_configured(config, path) for path in calibration_paths]
+    for one in others:
+        TruthOfDrive.of(one)
     with steps.timed("calibrate"):
         segmenters = [open_segmenter(config.segmentation, other) for other in others]
         confusion = confusion_of_drives(others, segmenters, CONFUSION_EDGES_M, cache)
@@ -184,8 +208,13 @@ def _learn(
             raise ConfigError(f"Calibration drive {drive.name} saw no ground.")
         shares = TruthOfDrive.of(drive).shares(grid)
         intensity = learn_from_truth(made, grid, shares, _NAMES, f"simulated drive {drive.name}")
-        learned = _Learned(confusion, intensity, _class_shares(made, grid, shares))
-        model = _model(replace(OURS, uses_temperature=False), made.meta, learned)
+        learned = Learned(
+            tuple(other.id for other in others),
+            confusion,
+            intensity,
+            _class_shares(made, grid, shares),
+        )
+        model = _model(OURS, made.meta, learned)
         truth = truth_of_classes(
             true_classes(shares, _NAMES), (*_NAMES, OTHER), model.classes, drive.name
         )
@@ -193,7 +222,7 @@ def _learn(
         rows, cols = cells.cells.T
         fit = fit_temperature(cells.evidence, truth.index[rows, cols], cells.offset)
         learned = replace(learned, temperature=fit.temperature)
-        window = read_window(made, grid, _model(OURS, made.meta, learned), 1)
+        window = read_window(made, grid, model, 1)
         decision = fit_decision(window.dataset["posterior"].values, truth.index, model.classes)
     _LOG.info(
         "Temperature %.2f on %d cells of %s; weights of the decision %s.",
@@ -222,8 +251,7 @@ def _scored(
     drive: Drive,
     config: Config,
     maps: dict[str, SemanticMap],
-    learned: _Learned,
-    others: Sequence[Drive],
+    learned: Learned,
     segmenter: str,
     steps: Steps,
 ) -> Evaluated:
@@ -258,18 +286,13 @@ def _scored(
     ours = models["ours"]
     truth = true_classes(shares, _NAMES)
     told = truth_of_classes(truth, (*_NAMES, OTHER), ours.classes, drive.name)
-    cells = read_evidence(
-        maps[OUR_MAP],
-        grid,
-        replace(ours, votes_per_count=ours.votes_per_count * learned.temperature),
-        told.index >= 0,
-    )
+    cells = read_evidence(maps[OUR_MAP], grid, ours, told.index >= 0)
     rows, cols = cells.cells.T
     true_of_cells = told.index[rows, cols]
     evaluation = DriveEvaluation(
         world=drive.name,
         drive=drive.id,
-        calibration=tuple(other.id for other in others),
+        calibration=learned.drive_ids,
         segmenter=segmenter,
         length_m=drive.trajectory.length_m,
         num_images=len(drive.images),
@@ -339,7 +362,7 @@ def _scores(
     return paper_scores(posterior, window.classes, shares, _NAMES, mask, paint_share=paint_share)
 
 
-def _model(method: Method, meta: MapMeta, learned: _Learned) -> ObservationModel:
+def _model(method: Method, meta: MapMeta, learned: Learned) -> ObservationModel:
     given: dict[str, Any] = dict(method.observation)
     if method.uses_temperature:
         given["temperature"] = learned.temperature

@@ -82,25 +82,22 @@ PAPER_METHODS: Final[tuple[Method, ...]] = (
 )
 """Source: Paz et al. 2020, table of results."""
 
-_ALL_LEARNED: Final[dict[str, bool]] = {
-    "uses_priors": True,
-    "uses_learned_intensity": True,
-    "uses_temperature": True,
-}
+_LEARNED: Final[dict[str, bool]] = {"uses_priors": True, "uses_learned_intensity": True}
 
-OURS: Final = Method("ours", OUR_MAP, _OURS, **_ALL_LEARNED)
+OURS: Final = Method("ours", OUR_MAP, _OURS, **_LEARNED, uses_decision=True)
 
 OUR_METHODS: Final[tuple[Method, ...]] = (
     Method("visible", VISIBLE_MAP, _OURS),
     Method("+ bands", OUR_MAP, _OURS),
     Method("+ priors", OUR_MAP, _OURS, uses_priors=True),
-    Method("+ intensity", OUR_MAP, _OURS, uses_priors=True, uses_learned_intensity=True),
+    Method("+ intensity", OUR_MAP, _OURS, **_LEARNED),
     OURS,
-    Method("ours, decided", OUR_MAP, _OURS, **_ALL_LEARNED, uses_decision=True),
+    Method("+ intensity, temperature", OUR_MAP, _OURS, **_LEARNED, uses_temperature=True),
 )
 """Occlusion test and the class ``other``; then, each on top of the one before, a confusion matrix
-by range, priors and intensity as learned on the calibration drive, the temperature fitted
-there (``ours``), and classes decided for as the calibration drive showed to be best."""
+by range, priors and intensity as learned on the calibration drive, and classes decided for
+as that drive showed to be best (``ours``). The temperature is there to make probabilities
+honest, not to decide by: it takes weight from the votes and leaves it to the prior."""
 
 MODE_METHODS: Final[tuple[Method, ...]] = (
     Method("CFN, count mode frame", "clip_frame", {**_PAPER, "model": "confusion"}),

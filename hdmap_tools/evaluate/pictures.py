@@ -135,8 +135,10 @@ def _draw_local(
     """The local map as it was when an image was taken, beside the finished global one."""
     drive, config = evaluated.drive, evaluated.config
     dense = config.association.model_copy(update={"method": "dense", "also": ()})
-    source = FrameSource(drive, config.model_copy(update={"association": dense}))
     meta = evaluated.maps[OUR_MAP].meta
+    fusion = config.fusion.model_copy(update={"range_edges_m": meta.range_edges_m})
+    config = config.model_copy(update={"association": dense, "fusion": fusion})
+    source = FrameSource(drive, config)
     segmenter = open_segmenter(config.segmentation, drive)
     local = LocalMap(meta)
     until = drive.images.index(image) + 1

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from hdmap_tools.compare.paper import EVALUATED, PaperScores, paper_table
+from hdmap_tools.compare.paper import EVALUATED, PaperScores, paper_table, pooled_scores
 from hdmap_tools.compare.reliability import ReliabilityCurve
+from hdmap_tools.errors import ConfigError
 
 SIMULATED: str = "SIMULATED drives with exact truth; the paper's figures are from a recorded drive on a private campus"
 
@@ -47,7 +48,7 @@ class DriveEvaluation(BaseModel):
             the share of the road there that it knows.
         by_terrain: By method of association and part of the terrain.
         temperature: Fitted on the calibration drive.
-        decision: Weights of classes with which ``ours, decided`` decides, fitted there.
+        decision: Weights of classes with which ``ours`` decides, fitted there.
         priors: Share of each class in what the calibration drive saw.
         reliability_before, reliability_after: Of our map, at temperature 1 and at that one.
         recall: Share of the true pixels of the calibration drives that the segmenter labels
@@ -138,6 +139,20 @@ class DriveEvaluation(BaseModel):
                         ]
                     )
         return out.getvalue()
+
+
+def pooled(evaluations: Sequence[DriveEvaluation]) -> dict[str, PaperScores]:
+    """Scores of each method over the cells of several drives, with hole filling.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    if not evaluations:
+        raise ConfigError("There is no evaluated drive to add up.")
+    return {
+        name: pooled_scores([one.methods[name].filled for one in evaluations])
+        for name in evaluations[0].methods
+    }
 
 
 def _flat(nested: Mapping[str, Mapping[str, PaperScores]]) -> dict[str, PaperScores]:

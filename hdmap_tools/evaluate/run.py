@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from hdmap_tools.compare.paper import paper_table
 from hdmap_tools.config import Config
 from hdmap_tools.errors import ConfigError
-from hdmap_tools.evaluate.experiment import Evaluated, evaluate_drive
+from hdmap_tools.evaluate.experiment import Evaluated, Learned, evaluate_drive, learn
 from hdmap_tools.evaluate.pictures import draw_pictures
-from hdmap_tools.evaluate.report import DriveEvaluation
+from hdmap_tools.evaluate.report import SIMULATED, DriveEvaluation, pooled
 from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.segmentation.cache import LabelCache
 from hdmap_tools.simulate.drive import SimulationProgress, simulate_drive
@@ -25,6 +26,7 @@ JSON_NAME: Final = "evaluation.json"
 CSV_NAME: Final = "evaluation.csv"
 TEXT_NAME: Final = "evaluation.txt"
 CONFUSION_NAME: Final = "confusion.json"
+POOLED_NAME: Final = "pooled.txt"
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,8 @@ _CALIBRATION_SEED: Final = 1000
 """Calibration drives have seeds from the evaluated one's plus this: other starts, other wear, other traffic."""
 
 
-def evaluate(
-    world_or_drive: Path,
+def evaluate_all(
+    worlds_or_drives: Sequence[Path],
     out: Path,
     config: Config,
     preset: Preset,
@@ -73,18 +75,69 @@ def evaluate(
     overwrite: bool = False,
     steps: Steps | None = None,
     progress: SimulationProgress | None = None,
+) -> list[DriveEvaluation]:
+    """Evaluate each of several worlds or drives; the result of the n-th is in ``out/<n>_<name>``.
+
+    With more than one, the figures over all their cells are in ``out/pooled.txt``. See `evaluate`.
+    """
+    steps = steps or Steps()
+    with result_folder(out, COMMAND, overwrite) as folder:
+        learned = None
+        if calibration:
+            _require_usable(worlds_or_drives)
+            scratch = folder.parent / "scratch"
+            scratch.mkdir()
+            learned = learn(calibration, scratch, config, cache=cache, steps=steps)
+        found = [
+            evaluate(
+                one,
+                folder if len(worlds_or_drives) == 1 else folder / f"{number}_{one.stem}",
+                config,
+                preset,
+                settings,
+                learned=learned,
+                cache=cache,
+                scratch=folder.parent / f"scratch_{number}",
+                steps=steps,
+                progress=progress,
+            )
+            for number, one in enumerate(worlds_or_drives, 1)
+        ]
+        if len(found) > 1:
+            (folder / POOLED_NAME).write_text(pooled_text(found), encoding="utf-8")
+    return found
+
+
+def pooled_text(evaluations: Sequence[DriveEvaluation]) -> str:
+    """The table over the cells of several drives, for people."""
+    drives = ", ".join(f"{one.drive} ({one.length_m:.0f} m)" for one in evaluations)
+    return f"Over the cells of {drives}.\n{SIMULATED}.\n\n{paper_table(pooled(evaluations))}\n"
+
+
+def evaluate(
+    world_or_drive: Path,
+    out: Path,
+    config: Config,
+    preset: Preset,
+    settings: SimulationSettings,
+    *,
+    learned: Learned | None = None,
+    scratch: Path,
+    cache: LabelCache | None = None,
+    steps: Steps | None = None,
+    progress: SimulationProgress | None = None,
 ) -> DriveEvaluation:
     """Evaluate on a simulated drive, or on one that is simulated for it.
 
     Args:
         world_or_drive: A map as `read_world` takes it, or a drive of `hdmap simulate`.
-        out: Folder to make: tables, JSON, CSV, pictures, the confusion matrix.
+        out: Folder: tables, JSON, CSV, pictures, the confusion matrix.
         config: Segmentation, point map, cell size.
         preset: Lengths of simulated drives.
         settings: What simulated drives are like; seed and length of the evaluated one.
-        calibration: Other drives to measure confusion on; empty: they are simulated too.
+        learned: From other drives; None: they are simulated too.
+        scratch: Folder to make for simulated drives, point maps and semantic maps.
         cache: Where label images are kept.
-        overwrite: Replace an earlier result.
         steps: Told of images.
         progress: Told of what is simulated.
 
@@ -93,26 +146,39 @@ def evaluate(
         HDMapError: Whatever cannot be read, simulated or used.
     """
     steps = steps or Steps()
-    with result_folder(out, COMMAND, overwrite) as folder:
-        scratch = folder.parent / "scratch"
-        scratch.mkdir()
-        drive, others = world_or_drive, tuple(calibration)
-        if not (drive / TRUTH_FOLDER).is_dir():
-            read_world(drive)  # says what is wrong with it before anything is simulated
-            with steps.timed("simulate"):
-                if not others:
-                    others = _simulated_others(drive, scratch, preset, settings, progress)
-                drive = simulate_drive(drive, scratch / "drive", settings, progress=progress)
-        elif not others:
-            raise ConfigError(
-                f"{drive} is a drive; give at least one other drive with --calibration, on which "
-                "confusion, intensity and temperature are measured."
-            )
-        evaluated = evaluate_drive(drive, others, scratch, config, cache=cache, steps=steps)
-        with steps.timed("pictures"):
-            draw_pictures(evaluated, folder, cache)
-        _write(evaluated, folder, config)
+    out.mkdir(parents=True, exist_ok=True)
+    scratch.mkdir()
+    _require_usable([world_or_drive])
+    drive = world_or_drive
+    if not _is_drive(drive):
+        others: tuple[Path, ...] = ()
+        with steps.timed("simulate"):
+            if learned is None:
+                others = _simulated_others(drive, scratch, preset, settings, progress)
+            drive = simulate_drive(drive, scratch / drive.stem, settings, progress=progress)
+        if learned is None:
+            learned = learn(others, scratch, config, cache=cache, steps=steps)
+    elif learned is None:
+        raise ConfigError(
+            f"{drive} is a drive; give at least one other drive with --calibration, on which "
+            "confusion, intensity and temperature are measured."
+        )
+    evaluated = evaluate_drive(drive, learned, scratch, config, cache=cache, steps=steps)
+    with steps.timed("pictures"):
+        draw_pictures(evaluated, out, cache)
+    _write(evaluated, out, config)
     return evaluated.evaluation
+
+
+def _is_drive(path: Path) -> bool:
+    return (path / TRUTH_FOLDER).is_dir()
+
+
+def _require_usable(worlds_or_drives: Sequence[Path]) -> None:
+    """Say what is wrong with a world before anything is simulated or measured."""
+    for path in worlds_or_drives:
+        if not _is_drive(path):
+            read_world(path)
 
 
 def _simulated_others(

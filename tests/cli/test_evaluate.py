@@ -157,6 +157,6 @@ def test_the_simulated_drives_of_an_evaluation_differ(here, monkeypatch, hdmap):
     assert len({settings["seed"] for _, settings in made}) == 3
     assert {settings["difficulty"] for _, settings in made} == {"hard"}
     assert {settings["pose_errors"]["noise_m"] for _, settings in made} == {0.1}
-    assert made[-1][0] == "drive"
+    assert made[-1][0] == "demo_town"
     assert made[-1][1]["seed"] == 7
     assert left_in(here) == set()
