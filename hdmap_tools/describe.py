@@ -6,27 +6,33 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from hdmap_tools.compare.mask_file import load_mask
+from hdmap_tools.compare.reference import is_truth_raster
 from hdmap_tools.errors import FormatError
 from hdmap_tools.formats.by_name import is_readable, read_vector_map
 from hdmap_tools.fusion.cell_counts import TILE_CELLS
 from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
+from hdmap_tools.point_map.point_files import is_point_file, read_point_file
+from hdmap_tools.point_map.point_map import META_NAME, TILE_MM, PointMap
 from hdmap_tools.readers.open_drive import open_drive
+from hdmap_tools.simulate.truth_files import SIMULATION_NAME, TRUTH_FOLDER
 
 
 def describe(
     path: Path, layout: str = "auto", scene: str | None = None, cameras: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Facts about a drive, a semantic map (or the folder of a run), a vector map, or a mask.
+    """Facts about a drive, a semantic map (or the folder of a run), a point map, or a file.
+
+    Files are vector maps, masks, and point clouds.
 
     Raises:
         HDMapError: If it is none of these, or cannot be read.
     """
     if not path.exists():
         raise FormatError(
-            f"{path} does not exist; expected a drive, a semantic map, a vector map or a mask."
+            f"{path} does not exist; expected a drive, a semantic map, a point map, a vector map or a mask."
         )
     if path.is_file():
         suffix = path.suffix.lower()
@@ -34,11 +40,15 @@ def describe(
             return _describe_mask(path)
         if suffix == ".json":
             _refuse_figures(path)
+        if is_point_file(path):
+            return _describe_point_cloud(path)
         return _describe_vector_map(path)
     if is_semantic_map(path):
         return _describe_semantic_map(path)
     if is_semantic_map(path / "semantic_map"):
         return _describe_semantic_map(path / "semantic_map")
+    if (path / META_NAME).is_file() and (path / "tiles").is_dir():
+        return _describe_point_map(path)
     return _describe_drive(path, layout, scene, cameras)
 
 
@@ -62,10 +72,78 @@ def _describe_drive(
             for name, camera in sorted(drive.cameras.items())
         },
         "reference_maps": [
-            {"path": str(p), "is_readable": p.suffix.lower() == ".png" or is_readable(p)}
-            for p in drive.reference_maps
+            {"path": str(p), "is_readable": _is_reference(p)} for p in drive.reference_maps
         ],
+        **_simulation(path),
         "warnings": list(drive.warnings),
+    }
+
+
+def _is_reference(path: Path) -> bool:
+    """Whether `hdmap compare` takes it."""
+    return path.suffix.lower() == ".png" or is_truth_raster(path) or is_readable(path)
+
+
+def _simulation(path: Path) -> dict[str, Any]:
+    """Of a simulated drive, how it was made."""
+    document = path / TRUTH_FOLDER / SIMULATION_NAME
+    if not document.is_file():
+        return {}
+    try:
+        made = json.loads(document.read_bytes())
+        settings = made["settings"]
+        return {
+            "simulated": {
+                "world": str(made["world"]["name"]),
+                **{name: settings[name] for name in _SHOWN_SETTINGS},
+                "pose_errors": ", ".join(
+                    f"{name} {value:g}" for name, value in settings["pose_errors"].items()
+                ),
+            }
+        }
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise FormatError(
+            f"{document} does not say how the drive was simulated ({type(error).__name__}: {error!s:.80}); copy "
+            "the drive again, or remove the file."
+        ) from error
+
+
+_SHOWN_SETTINGS: Final = ("seed", "weather", "difficulty", "lidar", "calibration_error_m")
+
+
+def _describe_point_map(path: Path) -> dict[str, Any]:
+    point_map = PointMap.open(path)
+    meta, tiles = point_map.meta, point_map.tile_indices()
+    tile_m2 = (TILE_MM / 1000.0) ** 2
+    return {
+        "kind": "point map",
+        "place": meta.frame.describe(),
+        "made_from": meta.source,
+        "points": point_map.num_points,
+        "tiles": f"{len(tiles)} ({len(tiles) * tile_m2:.0f} m2)",
+        "bounds_m": _bounds(point_map.bounds_m),
+        "voxel_m": meta.voxel_mm / 1000.0,
+        "cell_m": meta.cell_mm / 1000.0,
+        "asphalt_intensity": meta.asphalt_intensity,
+        "drives": {
+            drive.id: f"{drive.num_sweeps} sweeps, poses {'refined' if drive.is_refined else 'as given'}"
+            for drive in meta.drives
+        },
+    }
+
+
+def _describe_point_cloud(path: Path) -> dict[str, Any]:
+    cloud = read_point_file(path)
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    return {
+        "kind": "point cloud",
+        "place": "not known" if cloud.crs is None else cloud.crs.name,
+        "points": len(cloud),
+        "left_out": f"{cloud.num_dropped} points that are NaN or infinite",
+        "intensity": cloud.intensity is not None,
+        "ground": "not marked" if cloud.is_ground is None else f"{cloud.is_ground.mean():.1%}",
+        "bounds_m": _bounds((*low[:2].tolist(), *high[:2].tolist())),
+        "height_m": f"{low[2]:.2f} to {high[2]:.2f}",
     }
 
 

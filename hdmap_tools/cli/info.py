@@ -1,4 +1,4 @@
-"""`hdmap info`: what a drive, a semantic map, a vector map or a mask holds."""
+"""`hdmap info`: what a drive, a semantic map, a point map, a vector map or a mask holds."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from hdmap_tools.cli import options
 @options.overwrite_option
 @options.json_option
 def command(path: Path | None, **given: Any) -> None:
-    """Say what a drive, a semantic map or a vector file holds.
+    """Say what a drive, a semantic map, a point map or a vector file holds.
 
     \b
     Examples:
       hdmap info path/to/drive
       hdmap info --default-config > hdmap.yaml
 
-    PATH is a drive, a semantic map or the folder of a run, a vector map, or a mask PNG with
-    its JSON. A vector map's provenance is shortened; --json has all of it.
+    PATH is a drive, a semantic map or the folder of a run, a point map or cloud, a vector
+    map, or a mask PNG with its JSON. A vector map's provenance is shortened; --json has all of it.
     """
     from hdmap_tools.config import Config
     from hdmap_tools.describe import describe

@@ -36,7 +36,7 @@ _COMMANDS: Final = {
     "simulate": "Drive through a map: images, lidar sweeps, poses, and their exact truth.",
     "evaluate": "Measure the paper's methods and ours on simulated drives with exact truth.",
     "demo": "Simulate a short drive, map it, and hold the map against the truth.",
-    "info": "Say what a drive, a semantic map or a vector file holds.",
+    "info": "Say what a drive, a semantic map, a point map or a vector file holds.",
     "plugins": "List, describe and check vectorizer plugins.",
 }
 """Name and summary of each command; the module of a command is imported when it is called."""

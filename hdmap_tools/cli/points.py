@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 
@@ -64,5 +64,26 @@ def summary(report: dict[str, Any], out: Path) -> str:
     sizes = f"{report['num_points']} points in {report['num_tiles']} tiles"
     lines = [f"{', '.join(report['sources'])}: {sizes} at {out} in {report['seconds']:.1f} s"]
     for drive, moved in report["refined_poses"].items():
-        lines.append(f"{drive}: poses {'refined' if moved else 'as given'}")
+        lines.append(f"{drive}: poses {_refinement(moved, report['refinement'].get(drive))}")
     return "\n".join(lines)
+
+
+def _refinement(is_changed: bool, found: dict[str, Any] | None) -> str:
+    """What became of a drive's poses, by how much and why; `found` as `RefineReport`."""
+    if found is None:
+        return "as given, refinement was not asked for"
+    if not is_changed:
+        return f"as given: {found['reason'] or 'nothing to refine'}"
+    by = f"{100 * found['correction_m']:.1f} cm and {found['correction_deg']:.3f} degrees RMS"
+    sweeps = f"{found['num_registered']} of {found['num_sweeps']} sweeps registered"
+    held = ", ".join(
+        name if share >= _HELD else f"{name} in {share:.0%} of sweeps"
+        for name, share in found["held"].items()
+        if share > 0.0
+    )
+    because = f" ({found['reason']})" if found["reason"] else ""
+    return f"refined by {by}, {sweeps}; held: {held}{because}"
+
+
+_HELD: Final = 0.995
+"""From this share of sweeps on, a direction is said to be held without a number."""

@@ -115,7 +115,7 @@ def load_reference(
         FormatError: If the file cannot be read, or does not overlap the grid.
         CRSMismatchError: If its place relative to the map cannot be known.
     """
-    if _is_truth_raster(path):
+    if is_truth_raster(path):
         from hdmap_tools.compare.truth_reference import reference_from_truth_raster
 
         return reference_from_truth_raster(path, grid)
@@ -149,7 +149,7 @@ def load_references(path: Path, grids: Mapping[str, BevGrid]) -> dict[str, Refer
     Raises:
         HDMapError: As `load_reference`.
     """
-    if grids and _is_truth_raster(path):
+    if grids and is_truth_raster(path):
         from hdmap_tools.compare.truth_reference import references_from_truth_raster
 
         made = references_from_truth_raster(path, list(grids.values()))
@@ -157,7 +157,8 @@ def load_references(path: Path, grids: Mapping[str, BevGrid]) -> dict[str, Refer
     return {name: load_reference(path, grid) for name, grid in grids.items()}
 
 
-def _is_truth_raster(path: Path) -> bool:
+def is_truth_raster(path: Path) -> bool:
+    """Whether a folder is the truth raster of a simulated drive."""
     return path.is_dir() and (path / "index.json").is_file()
 
 

@@ -12,6 +12,7 @@ from hdmap_tools.point_map.build import PosedDrive, Progress, build_point_map
 from hdmap_tools.point_map.from_cloud import build_from_file
 from hdmap_tools.point_map.point_files import is_point_file
 from hdmap_tools.point_map.point_map import PointMap
+from hdmap_tools.point_map.refine_config import RefineReport
 from hdmap_tools.readers.drive import Drive
 
 _LOG = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ def with_points(
         path = scratch / "points"
         path.mkdir(parents=True)
         point_map = build_point_map(
-            posed_drives([drive], config),
+            [posed for posed, _ in posed_drives([drive], config, progress)],
             path,
             config.points,
             max_pose_gap_s=config.drive.max_pose_gap_s,
@@ -78,13 +79,19 @@ def with_points(
     return config.model_copy(update={"association": association}), drive
 
 
-def posed_drives(drives: Sequence[Drive], config: Config) -> list[PosedDrive]:
-    """Drives at refined poses, where `points.refine_poses` says so and registration found hold."""
+def posed_drives(
+    drives: Sequence[Drive], config: Config, progress: Progress | None = None
+) -> list[tuple[PosedDrive, RefineReport | None]]:
+    """Drives at refined poses, where `points.refine_poses` says so and registration found hold.
+
+    Returns:
+        For each drive its poses, and what refinement did; None where it was not asked for.
+    """
     if not config.points.refine_poses:
-        return [PosedDrive.as_given(drive) for drive in drives]
+        return [(PosedDrive.as_given(drive), None) for drive in drives]
     from hdmap_tools.point_map.refine_poses import refine_poses
 
     return [
-        PosedDrive(drive, refined.trajectory, refined.is_changed)
-        for drive, refined in zip(drives, refine_poses(drives), strict=True)
+        (PosedDrive(drive, refined.trajectory, refined.is_changed), refined.report)
+        for drive, refined in zip(drives, refine_poses(drives, progress=progress), strict=True)
     ]

@@ -43,7 +43,8 @@ def make_points(
         progress: Told of sweeps done.
 
     Returns:
-        Sources, points, tiles, seconds, and by drive whether its poses were refined.
+        Sources, points, tiles, seconds, and by drive whether its poses were refined, and what
+        refinement did (`RefineReport`), if it was asked for.
 
     Raises:
         HDMapError: Whatever cannot be read, made or written; then nothing is left behind.
@@ -59,7 +60,7 @@ def make_points(
                     f"A point cloud ({files[0].name}) is taken alone; found {len(sources)} sources."
                 )
             frame = MapFrame() if config.export.origin is None else _frame_at(config)
-            names = [files[0].name]
+            names, reports = [files[0].name], {}
             made = build_from_file(files[0], folder, config.points, frame)
         else:
             drives = [open_configured(config, path) for path in sources]
@@ -67,8 +68,10 @@ def make_points(
             if len({drive.id for drive in drives}) < len(drives):
                 raise PointMapError("Two of the drives have the same id; give each drive once.")
             names = [drive.id for drive in drives]
+            posed = posed_drives(drives, config, progress)
+            reports = {p.drive.id: report.model_dump() for p, report in posed if report}
             made = build_point_map(
-                posed_drives(drives, config),
+                [p for p, _ in posed],
                 folder,
                 config.points,
                 max_pose_gap_s=config.drive.max_pose_gap_s,
@@ -82,6 +85,7 @@ def make_points(
             "num_points": made.num_points,
             "num_tiles": len(made.tile_indices()),
             "refined_poses": {drive.id: drive.is_refined for drive in made.meta.drives},
+            "refinement": reports,
             "seconds": round(time.perf_counter() - start, 3),
         }
 

@@ -55,19 +55,21 @@ class DriveOfPoints(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: str
-    poses: str
+    poses: Annotated[str, Field(pattern=r"^[^/\\]+\.feather$")]
     is_refined: bool
     num_sweeps: Annotated[int, Field(ge=0)]
 
 
 class TileOfPoints(BaseModel):
-    """One tile: its index and how many points it has, which tells a truncated file."""
+    """One tile: its index, how many points it has, and CRC-32 of its files, which tell a wrong one."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    x: int
-    y: int
+    x: Annotated[int, Field(ge=-(10**6), le=10**6)]
+    y: Annotated[int, Field(ge=-(10**6), le=10**6)]
     num_points: Annotated[int, Field(ge=1)]
+    points_crc32: int | None = None
+    cells_crc32: int | None = None
 
 
 class PointMapMeta(BaseModel):
@@ -168,7 +170,7 @@ class PointMap:
     def __init__(self, path: Path, meta: PointMapMeta) -> None:
         self.path = path
         self.meta = meta
-        self._num_points = {(t.x, t.y): t.num_points for t in meta.tiles}
+        self._tiles = {(t.x, t.y): t for t in meta.tiles}
         self._recent: OrderedDict[TileIndex, _TileInMemory] = OrderedDict()
 
     @classmethod
@@ -196,8 +198,7 @@ class PointMap:
         for index, tile in tiles:
             if len(tile) == 0:
                 continue
-            _write_tile(path, index, tile)
-            written.append(TileOfPoints(x=index[0], y=index[1], num_points=len(tile)))
+            written.append(_write_tile(path, index, tile))
         if not written:
             raise PointMapError(
                 f"No points for the point map at {path}: expected lidar returns on a ground."
@@ -241,16 +242,18 @@ class PointMap:
             ) from error
         except FormatError as error:
             raise PointMapError(f"{path / META_NAME} is wrong: {error}") from error
+        if not meta.tiles:
+            raise PointMapError(f"{path / META_NAME} lists no tiles; make the map anew.")
         return cls(path, meta)
 
     def tile_indices(self) -> tuple[TileIndex, ...]:
         """Tiles with points, in order."""
-        return tuple(sorted(self._num_points))
+        return tuple(sorted(self._tiles))
 
     @property
     def num_points(self) -> int:
         """Points in all tiles."""
-        return sum(self._num_points.values())
+        return sum(tile.num_points for tile in self._tiles.values())
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -266,14 +269,14 @@ class PointMap:
         Raises:
             PointMapError: If there is no such tile, or its file is damaged.
         """
-        if index not in self._num_points:
+        if index not in self._tiles:
             raise PointMapError(f"{self.path} has no tile {index}.")
-        name = _tile_name(index)
-        points = read_table(self.path / "tiles" / name, _POINT_COLUMNS)
-        cells = read_table(self.path / "cells" / name, _CELL_COLUMNS)
-        if (found := len(points["cell"])) != self._num_points[index]:
+        listed, name = self._tiles[index], _tile_name(index)
+        points = read_table(self.path / "tiles" / name, _POINT_COLUMNS, listed.points_crc32)
+        cells = read_table(self.path / "cells" / name, _CELL_COLUMNS, listed.cells_crc32)
+        if (found := len(points["cell"])) != listed.num_points:
             raise PointMapError(
-                f"{self.path / 'tiles' / name} has {found} points, expected {self._num_points[index]}; it "
+                f"{self.path / 'tiles' / name} has {found} points, expected {listed.num_points}; it "
                 "is damaged or from another map. Make the map anew."
             )
         size = self.meta.cells_a_side**2
@@ -301,7 +304,7 @@ class PointMap:
         parts = []
         for tx in range(x0 // side, (x1 - 1) // side + 1):
             for ty in range(y0 // side, (y1 - 1) // side + 1):
-                if (tx, ty) not in self._num_points:
+                if (tx, ty) not in self._tiles:
                     continue
                 tile = self._in_memory((tx, ty))
                 columns = max(x0 - tx * side, 0), min(x1 - tx * side, side)
@@ -340,7 +343,7 @@ class PointMap:
         reach = int(np.ceil(margin_m * 1000.0 / TILE_MM))
         for ix, iy in np.unique(indices, axis=0).tolist():
             for dx in range(-reach, reach + 1):
-                if any((ix + dx, iy + dy) in self._num_points for dy in range(-reach, reach + 1)):
+                if any((ix + dx, iy + dy) in self._tiles for dy in range(-reach, reach + 1)):
                     return
         low, high = trajectory.translations.min(axis=0), trajectory.translations.max(axis=0)
         x0, y0, x1, y1 = self.bounds_m
@@ -357,7 +360,7 @@ class PointMap:
         flat = (cells[:, 1] - tiles[:, 1] * side) * side + cells[:, 0] - tiles[:, 0] * side
         heights = np.full(len(cells), np.nan)
         for tx, ty in np.unique(tiles, axis=0).tolist():
-            if (tx, ty) in self._num_points:
+            if (tx, ty) in self._tiles:
                 here = (tiles[:, 0] == tx) & (tiles[:, 1] == ty)
                 heights[here] = self._in_memory((tx, ty)).heights_m[flat[here]]
         return heights
@@ -409,12 +412,21 @@ def _tile_name(index: TileIndex) -> str:
     return f"{index[0]}_{index[1]}.feather"
 
 
-def _write_tile(path: Path, index: TileIndex, tile: PointTile) -> None:
+def _write_tile(path: Path, index: TileIndex, tile: PointTile) -> TileOfPoints:
     x, y, z = tile.points_mm.T
     columns = (x, y, z, tile.intensity, tile.hits, tile.is_ground, tile.cell)
-    write_table(path / "tiles" / _tile_name(index), dict(zip(_POINT_COLUMNS, columns, strict=True)))
+    name = _tile_name(index)
+    points = dict(zip(_POINT_COLUMNS, columns, strict=True))
+    points_crc32 = write_table(path / "tiles" / name, points)
     cells = (tile.ground_cells, tile.ground_height_mm, tile.roughness_mm, tile.ground_points)
-    write_table(path / "cells" / _tile_name(index), dict(zip(_CELL_COLUMNS, cells, strict=True)))
+    ground = dict(zip(_CELL_COLUMNS, cells, strict=True))
+    return TileOfPoints(
+        x=index[0],
+        y=index[1],
+        num_points=len(tile),
+        points_crc32=points_crc32,
+        cells_crc32=write_table(path / "cells" / name, ground),
+    )
 
 
 def is_point_map(path: Path) -> bool:

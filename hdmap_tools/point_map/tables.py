@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
+from zlib import crc32
 
 import numpy as np
 
@@ -24,26 +25,34 @@ _TYPES: Final = {
 _POSE_COLUMNS: Final = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
-def write_table(path: Path, columns: Mapping[str, NDArrayAny]) -> None:
-    """Write columns of one length."""
+def write_table(path: Path, columns: Mapping[str, NDArrayAny]) -> int:
+    """Write columns of one length; gives the CRC-32 of the file."""
     import pyarrow as pa
     import pyarrow.feather
 
     arrays = {name: pa.array(np.ascontiguousarray(a, _TYPES[name])) for name, a in columns.items()}
-    pyarrow.feather.write_feather(pa.table(arrays), path, compression="lz4")
+    stream = pa.BufferOutputStream()
+    pyarrow.feather.write_feather(pa.table(arrays), stream, compression="lz4")
+    written = stream.getvalue()
+    path.write_bytes(written)
+    return crc32(written)
 
 
-def read_table(path: Path, names: Sequence[str]) -> dict[str, NDArrayAny]:
+def read_table(
+    path: Path, names: Sequence[str], expected_crc: int | None = None
+) -> dict[str, NDArrayAny]:
     """Columns by name, of the types that `write_table` wrote.
 
     Raises:
-        PointMapError: If the file is missing, truncated, or lacks a column.
+        PointMapError: If the file is missing, truncated, lacks a column, or is not the one
+            that was written with that CRC-32.
     """
     import pyarrow as pa
     import pyarrow.feather
 
     try:
-        table = pyarrow.feather.read_table(path, memory_map=False)
+        content = path.read_bytes()
+        table = pyarrow.feather.read_table(pa.BufferReader(content))
         table.validate(full=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -51,6 +60,11 @@ def read_table(path: Path, names: Sequence[str]) -> dict[str, NDArrayAny]:
             f"{path} of the point map cannot be read ({reason:.120}); it is missing or truncated. Copy "
             "the map again, or make it anew with `hdmap points`."
         ) from error
+    if expected_crc is not None and crc32(content) != expected_crc:
+        raise PointMapError(
+            f"{path} of the point map is not the file that was written with the map; it is damaged, or of "
+            "another tile or map. Copy the map again, or make it anew with `hdmap points`."
+        )
     columns = {}
     for name in names:
         found = table[name].to_numpy() if name in table.column_names else np.zeros(0)

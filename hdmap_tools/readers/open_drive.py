@@ -13,6 +13,9 @@ from hdmap_tools.readers.drive import Drive
 from hdmap_tools.readers.folders import os_errors_are_drive_errors, require_listable
 from hdmap_tools.readers.nuscenes_tables import find_version_folders
 
+_SIMULATION_NAME: Final = "simulation.json"
+"""Lies beside the true poses in `truth/` of a simulated drive."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -83,7 +86,9 @@ def _find_av2(path: Path) -> list[Path]:
         return [path]
     # A data root holds logs, or a folder for each split (train, val, test) of them.
     for pattern in (f"*/{av2.POSES_FILE}", f"*/*/{av2.POSES_FILE}"):
-        if found := sorted(file.parent for file in path.glob(pattern)):
+        found = sorted(file.parent for file in path.glob(pattern))
+        # A simulated drive's true poses are no drive of their own.
+        if found := [folder for folder in found if not (folder / _SIMULATION_NAME).is_file()]:
             return found
     return []
 

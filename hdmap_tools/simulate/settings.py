@@ -53,10 +53,10 @@ class PoseErrors(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    noise_m: Annotated[float, Field(ge=0)] = 0.0
-    noise_deg: Annotated[float, Field(ge=0)] = 0.0
-    drift_m: Annotated[float, Field(ge=0)] = 0.0
-    drift_deg: Annotated[float, Field(ge=0)] = 0.0
+    noise_m: Annotated[float, Field(ge=0, le=100)] = 0.0
+    noise_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+    drift_m: Annotated[float, Field(ge=0, le=100)] = 0.0
+    drift_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
     correlation_s: Annotated[float, Field(gt=0)] = 0.5
 
 
@@ -90,7 +90,7 @@ class SimulationSettings(BaseModel):
     image_height_px: Annotated[int, Field(ge=64, le=4096)] = 600
     camera_hz: Annotated[float, Field(gt=0, le=60)] = 5.0
     lidar_hz: Annotated[float, Field(gt=0, le=20)] = 10.0
-    speed_mps: Annotated[float, Field(gt=0, le=40)] = 8.0
+    speed_mps: Annotated[float, Field(ge=0.5, le=40)] = 8.0
     pose_errors: PoseErrors = PoseErrors()
-    calibration_error_m: Annotated[float, Field(ge=0)] = 0.0
-    calibration_error_deg: Annotated[float, Field(ge=0)] = 0.0
+    calibration_error_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    calibration_error_deg: Annotated[float, Field(ge=0, le=90)] = 0.0

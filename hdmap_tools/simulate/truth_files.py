@@ -20,6 +20,7 @@ from hdmap_tools.simulate.write_log import write_json
 from hdmap_tools.types import NDArrayByte
 
 TRUTH_FOLDER: Final = "truth"
+SIMULATION_NAME: Final = "simulation.json"
 LABEL_IMAGES: Final = "label_images"
 LABEL_SET: Final = "paz2020"
 """Label set of all true label images."""

@@ -36,6 +36,8 @@ NODE_M: Final = 0.2
 
 _NODES: Final = round(TILE_M / NODE_M) + 1
 
+_CODES: Final = frozenset(map(int, Mat))
+
 _ON_ROAD: Final = np.isin(
     np.arange(256),
     [
@@ -314,6 +316,10 @@ class TruthRaster:
         if codes is None or codes.shape != (TILE_CELLS, TILE_CELLS) or codes.dtype != np.uint8:
             raise FormatError(
                 f"{path} is missing or no truth tile of {TILE_CELLS} cells; simulate the drive again."
+            )
+        if found := set(np.flatnonzero(np.bincount(codes.ravel())).tolist()) - _CODES:
+            raise FormatError(
+                f"{path} holds unknown codes {sorted(found)}; simulate the drive again."
             )
         return np.ascontiguousarray(codes[::-1])
 

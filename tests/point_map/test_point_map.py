@@ -129,7 +129,14 @@ def test_damage_is_named(made, tmp_path):
         with pytest.raises(PointMapError, match=r"0_0\.feather.*truncated"):
             PointMap.open(made.path).read_tile((0, 0))
     path.write_bytes((made.path / "tiles" / "-1_0.feather").read_bytes())
-    PointMap.open(made.path).read_tile((0, 0))  # as many points: cannot be told
+    with pytest.raises(PointMapError, match=r"0_0\.feather.*another tile"):  # as many points
+        PointMap.open(made.path).read_tile((0, 0))
+    meta = made.path / "meta.json"
+    document = json.loads(meta.read_text())
+    for tile in document["tiles"]:  # a map that was written without them
+        del tile["points_crc32"], tile["cells_crc32"]
+    meta.write_text(json.dumps(document))
+    PointMap.open(made.path).read_tile((0, 0))
     path.write_bytes((made.path / "cells" / "0_0.feather").read_bytes())
     with pytest.raises(PointMapError, match="no column x_mm"):
         PointMap.open(made.path).read_tile((0, 0))
