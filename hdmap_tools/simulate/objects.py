@@ -36,6 +36,9 @@ _BARRIERS: Final = {
     LineKind.GUARD_RAIL: (0.75, 0.08, 0.45, Mat.GUARD_RAIL),
 }
 
+_HEADROOM_M: Final = 2.6
+"""Crowns over the road begin so high above the foot of their tree."""
+
 T = TypeVar("T")
 
 
@@ -224,7 +227,8 @@ class RoadsideObjects:
             if any(lot.distance(shapely.Point(tree.xy)) < 2.6 for lot in lots):
                 continue
             rng = rng_at(self.settings.seed, Purpose.TREE, *tree.rng_place, 99)
-            meshes.append(self._stand(furniture.tree(tree.size[0], rng), tree.xy, 0.0, corner, 0.1))
+            shape = _pruned(furniture.tree(tree.size[0], rng), tree.xy, self._area(tile))
+            meshes.append(self._stand(shape, tree.xy, 0.0, corner, 0.1))
         return meshes
 
     def _hedges(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
@@ -357,6 +361,22 @@ def _nearest(area: RoadArea, p: NDArrayFloat) -> tuple[NDArrayFloat, NDArrayFloa
     if distance < 1e-3 or distance > 38.0:
         return None
     return q, (p - q) / distance, distance
+
+
+def _pruned(tree: Mesh, xy: NDArrayFloat, area: RoadArea) -> Mesh:
+    """A tree at a place without the twigs that hang into the way of vehicles."""
+    low = tree.vertices[:, 2] < _HEADROOM_M
+    trunk = tree.triangles[tree.materials != Mat.FOLIAGE]
+    low[trunk.ravel()] = False
+    if low.any():
+        twigs = shapely.points(tree.vertices[low, :2].astype(np.float64) + xy)
+        # Triangles reach between their corners.
+        low[low] = shapely.dwithin(area.drivable, twigs, 1.0)
+    if not low.any():
+        return tree
+    vertices = tree.vertices.copy()
+    vertices[low, 2] = _HEADROOM_M
+    return Mesh(vertices, tree.triangles, tree.materials)
 
 
 def _rectangle(xy: NDArrayFloat, yaw: float, width: float, depth: float) -> BaseGeometry:
