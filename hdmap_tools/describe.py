@@ -139,7 +139,7 @@ def _describe_point_cloud(path: Path) -> dict[str, Any]:
         "kind": "point cloud",
         "place": "not known" if cloud.crs is None else cloud.crs.name,
         "points": len(cloud),
-        "left_out": f"{cloud.num_dropped} points that are NaN or infinite",
+        "left_out": f"{cloud.num_dropped} points that are NaN, infinite or not of this earth",
         "intensity": cloud.intensity is not None,
         "ground": "not marked" if cloud.is_ground is None else f"{cloud.is_ground.mean():.1%}",
         "bounds_m": _bounds((*low[:2].tolist(), *high[:2].tolist())),

@@ -96,6 +96,7 @@ def replaced_when_done(
     """
     path = Path(os.path.abspath(path))
     require_free(path, overwrite, is_ours)
+    made = [folder for folder in path.parents if not folder.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         parent = Path(
@@ -118,6 +119,9 @@ def replaced_when_done(
         ) from error
     finally:
         shutil.rmtree(parent, ignore_errors=True)
+        with contextlib.suppress(OSError):  # stops where something is in them
+            for folder in made:
+                folder.rmdir()
 
 
 def _put_in_place(made: Path, path: Path, aside: Path) -> None:

@@ -23,6 +23,8 @@ _LAS_GROUND: Final = 2
 _LAS_NOT_GROUND: Final = 1
 _LAS_SCALE_M: Final = 0.001
 _FEWEST: Final = 10
+_FURTHEST_M: Final = np.array([2e7, 2e7, 1e5])
+"""Along x, y and z: northings end at 1e7, and whole millimetres of height fit 32 bits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class PointCloud:
         intensity: (N,) uint8, None where the file has none.
         is_ground: (N,) where the file classifies any point so (LAS class 2), else None.
         crs: Of a georeferenced LAS file, a `pyproj.CRS`; None if it has none.
-        num_dropped: Points with NaN or infinite coordinates.
+        num_dropped: Points with coordinates that are NaN, infinite or not of this earth.
     """
 
     points: NDArrayFloat
@@ -90,11 +92,12 @@ def read_point_file(path: Path) -> PointCloud:
     if suffix not in SUFFIXES:
         raise PointMapError(f"{path}: expected a point cloud {', '.join(SUFFIXES)}.")
     cloud = _read_las(path) if suffix in LAS_SUFFIXES else _read_open3d(path)
-    finite: NDArrayBool = np.asarray(np.isfinite(cloud.points).all(axis=1))
+    # NaN compares false.
+    finite: NDArrayBool = np.asarray((np.abs(cloud.points) <= _FURTHEST_M).all(axis=1))
     if finite.sum() < _FEWEST:
         raise PointMapError(
-            f"{path} has {len(finite)} points, {int(finite.sum())} of them finite; expected a point cloud of "
-            "a street."
+            f"{path} has {len(finite)} points, {int(finite.sum())} of them usable; expected a point cloud of "
+            "a street, finite, in metres."
         )
     return PointCloud(
         cloud.points[finite],
@@ -148,7 +151,17 @@ def write_point_file(
 
             if not open3d().t.io.write_point_cloud(str(temporary), cloud):
                 raise PointMapError(f"open3d could not write {path}.")
+            # It takes a disk that fills up for success.
+            if (found := temporary.stat().st_size) < len(points) * _BYTES_A_POINT:
+                raise PointMapError(
+                    f"Cannot write {path}: {len(points)} points need {len(points) * _BYTES_A_POINT} bytes, "
+                    f"{found} were written; check free space."
+                )
     return len(points)
+
+
+_BYTES_A_POINT: Final = 3 * 8 + 1 + 1
+"""Of PCD and PLY: position, intensity, is_ground."""
 
 
 def _laspy() -> Any:

@@ -1,6 +1,7 @@
 """Bad input to `simulate`, `points`, `reliability` and `evaluate`: one line, and nothing left behind."""
 
 import json
+import os
 import shutil
 
 import cv2
@@ -10,7 +11,9 @@ import pyarrow.feather
 import pytest
 
 from hdmap_tools.config import load_config
+from hdmap_tools.errors import PointMapError
 from hdmap_tools.point_map.make import make_points
+from hdmap_tools.point_map.point_map import PointMap
 
 QUICK = ("--no-refine-poses",)
 TINY = ("--length-m", "10", "--image-size", "64x64", "--lidar", "vlp16")
@@ -259,3 +262,53 @@ def test_broken_coordinates_in_a_drive_leave_a_point_map(drive, hdmap):
     assert code == 0, err
     assert "NaN" in err
     assert "poses as given" in out
+
+
+def _write_ply(path, points):
+    header = "".join(f"property double {axis}\n" for axis in "xyz")
+    head = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{header}end_header\n"
+    )
+    path.write_bytes(head.encode() + np.ascontiguousarray(points, "<f8").tobytes())
+
+
+@pytest.mark.parametrize(
+    ("axis", "value"), [(0, 1e300), (0, 1e9), (0, np.nan), (2, -1e7), (2, 1e9), (1, np.inf)]
+)
+def test_points_not_of_this_earth_are_left_out(here, hdmap, axis, value):
+    cloud = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * (1, 1, 0.001)
+    cloud[:9, axis] = value
+    _write_ply(here / "c.ply", cloud)
+    code, _, err = hdmap("points", "c.ply", "-o", "points")
+    assert code == 0, err
+    assert "c.ply: 9 points" in err
+    assert PointMap.open(here / "points").bounds_m == (-25.6, -25.6, 25.6, 25.6)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+def test_points_that_a_full_disk_cut_short_are_not_kept(here, monkeypatch, suffix):
+    from hdmap_tools.geometry.map_frame import MapFrame
+    from hdmap_tools.open3d_import import open3d
+    from hdmap_tools.point_map.point_files import write_point_file
+    from hdmap_tools.point_map.values import MapPoints
+
+    points = MapPoints(np.zeros((1000, 3)), np.ones(1000, np.uint8), np.ones(1000, bool))
+    assert write_point_file(here / f"whole.{suffix}", [points], MapFrame()) == 1000
+    write = open3d().t.io.write_point_cloud
+
+    def cut_short(path, cloud):
+        write(path, cloud)
+        os.truncate(path, os.path.getsize(path) // 2)
+        return True  # as open3d does
+
+    monkeypatch.setattr(open3d().t.io, "write_point_cloud", cut_short)
+    with pytest.raises(PointMapError, match="check free space"):
+        write_point_file(here / f"cut.{suffix}", [points], MapFrame())
+    assert not (here / f"cut.{suffix}").exists()
+
+
+def test_folders_made_for_an_output_go_with_it(here, fails):
+    fails("demo", "-o", "demo", "--length-m", "1", says=("length_m",))
+    (here / "c.ply").write_bytes(b"")
+    fails("points", "c.ply", "-o", "new/folder/points", says=("c.ply",))
+    assert [p.name for p in here.iterdir()] == ["c.ply"]

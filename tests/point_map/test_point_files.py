@@ -63,7 +63,7 @@ def test_points_with_nan_are_left_out(points, tmp_path):
     write_point_file(
         path, [MapPoints(broken * np.nan, points.intensity, points.is_ground)], FRAME, True
     )
-    with pytest.raises(PointMapError, match="0 of them finite"):
+    with pytest.raises(PointMapError, match="0 of them usable"):
         read_point_file(path)
 
 
