@@ -36,16 +36,17 @@ def fit_decision(
     use = np.isfinite(posterior).all(axis=0) & (truth != NO_TRUTH)
     p, t = posterior[:, use].astype(np.float64), truth[use]
     at = [list(classes).index(str(c)) for c in EVALUATED]
+    # Of classes that this truth does not have nothing can be learned.
+    at = [k for k in at if (t == k).any()]
     best: tuple[float, dict[str, float]] = (-1.0, {})
+    if not at:
+        return best[1]
     for crosswalk, mark in itertools.product(WEIGHTS, WEIGHTS):
         weights = {str(MapClass.CROSSWALK): crosswalk, str(MapClass.LANE_MARK): mark}
         chosen = weighted(p, classes, weights).argmax(axis=0)
-        ious = []
-        for k in at:
-            either = ((chosen == k) | (t == k)).sum()
-            ious.append(((chosen == k) & (t == k)).sum() / either if either else np.nan)
+        ious = [((chosen == k) & (t == k)).sum() / ((chosen == k) | (t == k)).sum() for k in at]
         # Ties go to the weights nearest to 1, which change least.
-        score = float(np.nanmean(ious)) - 1e-6 * (abs(np.log(crosswalk)) + abs(np.log(mark)))
+        score = float(np.mean(ious)) - 1e-6 * (abs(np.log(crosswalk)) + abs(np.log(mark)))
         if score > best[0]:
             best = score, weights
     return best[1]

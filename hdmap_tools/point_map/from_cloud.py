@@ -45,7 +45,11 @@ def build_from_file(path: Path, folder: Path, config: PointsConfig, frame: MapFr
 
     cloud = read_point_file(path)
     if cloud.num_dropped:
-        _LOG.warning("%s: %d points that are NaN, infinite or not of this earth are left out.", path.name, cloud.num_dropped)
+        _LOG.warning(
+            "%s: %d points that are NaN, infinite or not of this earth are left out.",
+            path.name,
+            cloud.num_dropped,
+        )
     if cloud.crs is None:
         _LOG.warning("%s does not say where it lies; it is taken as city metres.", path.name)
         if _looks_geographic(cloud):
