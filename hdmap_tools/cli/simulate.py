@@ -29,6 +29,9 @@ class _ImageSize(click.ParamType):  # type: ignore[type-arg,unused-ignore]
 @click.argument("world", type=options.PATH)
 @click.option("-o", "--out", type=options.PATH, required=True, help="Folder to make.")
 @click.option("--seed", type=int, help="Everything random follows from it [default: 0].")
+@click.option(
+    "--world-seed", type=int, help="Same place for drives of other seeds [default: the seed]."
+)
 @click.option("--length-m", type=float, help="Length of the route [default: 300].")
 @click.option("--start", help="Lane id, or X,Y in the city frame [default: chosen by the seed].")
 @click.option(
@@ -106,6 +109,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
 
 _FIELD_OF_OPTION = {
     "seed": "seed",
+    "world_seed": "world_seed",
     "length_m": "length_m",
     "start": "start",
     "weather": "weather",

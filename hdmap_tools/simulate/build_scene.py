@@ -49,7 +49,7 @@ class SceneBuilder:
         self.world = world
         self.settings = settings
         self.index = WorldIndex(world)
-        self.terrain = terrain or Terrain(settings.seed, crown=RoadCrown(self.index))
+        self.terrain = terrain or Terrain(settings.place_seed, crown=RoadCrown(self.index))
         self.tiles = SurfaceTiles(self.index, settings)
         self.objects = RoadsideObjects(self.index, self.terrain, settings)
 

@@ -117,7 +117,7 @@ class RoadsideObjects:
         area = self._area(tile)
         if area.boundary.is_empty:
             return []
-        seed, found = self.settings.seed, []
+        seed, found = self.settings.place_seed, []
         walk_m = sidewalk_width((0, 0), seed)
         for k in range(4):
             rng = rng_at(seed, Purpose.LOT, *tile, k)
@@ -156,7 +156,7 @@ class RoadsideObjects:
     def _buildings(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
         meshes = self._mapped_buildings(tile, corner)
         for lot in self._accepted_lots(tile):
-            rng = rng_at(self.settings.seed, Purpose.LOT, *lot.rng_place, 99)
+            rng = rng_at(self.settings.place_seed, Purpose.LOT, *lot.rng_place, 99)
             wall = _WALLS[int(rng.integers(len(_WALLS)))]
             shape = furniture.building(*lot.size, float(rng.uniform(5.5, 17)), wall, rng)
             meshes.append(self._stand(shape, lot.xy, lot.yaw_rad, corner, 0.1))
@@ -171,7 +171,7 @@ class RoadsideObjects:
             if not polygon.intersects(box):
                 continue
             middle = np.array([polygon.centroid.x, polygon.centroid.y])
-            rng = rng_at(self.settings.seed, Purpose.LOT, *np.round(middle).astype(int))
+            rng = rng_at(self.settings.place_seed, Purpose.LOT, *np.round(middle).astype(int))
             wall = _WALLS[int(rng.integers(len(_WALLS)))]
             top = float(self.terrain.height_at(middle[None])[0] + rng.uniform(6, 18))
             part = shapely.intersection(polygon, box)
@@ -191,7 +191,7 @@ class RoadsideObjects:
 
     def _tree_candidates(self, tile: tuple[int, int]) -> list[Placed]:
         area = self._area(tile)
-        seed, found = self.settings.seed, []
+        seed, found = self.settings.place_seed, []
         for k in range(16):
             rng = rng_at(seed, Purpose.TREE, *tile, k)
             p = (np.array(tile) + np.array([k % 4, k // 4]) / 4 + rng.uniform(0, 0.25, 2)) * TILE_M
@@ -226,13 +226,13 @@ class RoadsideObjects:
                 continue
             if any(lot.distance(shapely.Point(tree.xy)) < 2.6 for lot in lots):
                 continue
-            rng = rng_at(self.settings.seed, Purpose.TREE, *tree.rng_place, 99)
+            rng = rng_at(self.settings.place_seed, Purpose.TREE, *tree.rng_place, 99)
             shape = _pruned(furniture.tree(tree.size[0], rng), tree.xy, self._area(tile))
             meshes.append(self._stand(shape, tree.xy, 0.0, corner, 0.1))
         return meshes
 
     def _hedges(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
-        area, seed = self._area(tile), self.settings.seed
+        area, seed = self._area(tile), self.settings.place_seed
         lots = [lot.footprint for t in _around(tile, 1) for lot in self._accepted_lots(t)]
         meshes = []
         for k in range(4):
@@ -258,7 +258,7 @@ class RoadsideObjects:
     # Poles
 
     def _lamps_and_signs(self, tile: tuple[int, int], corner: NDArrayFloat) -> list[Mesh]:
-        area, seed = self._area(tile), self.settings.seed
+        area, seed = self._area(tile), self.settings.place_seed
         meshes = []
         for k, purpose in enumerate((Purpose.LAMP, Purpose.SIGN, Purpose.SIGN)):
             rng = rng_at(seed, purpose, *tile, k)
@@ -289,7 +289,7 @@ class RoadsideObjects:
         area = self._area(tile)
         for k in np.sort(self.index.stop_line_tree.query(box, predicate="intersects")):
             line = shapely.get_coordinates(self.index.world.stop_lines[k])
-            rng = rng_at(self.settings.seed, Purpose.SIGN, *np.round(line[0]).astype(int))
+            rng = rng_at(self.settings.place_seed, Purpose.SIGN, *np.round(line[0]).astype(int))
             if rng.uniform() > 0.7:
                 continue
             ahead = self._ahead_at(self.index.world.stop_lines[k])

@@ -65,6 +65,9 @@ class SimulationSettings(BaseModel):
 
     Attributes:
         seed: Everything random follows from it.
+        world_seed: What stays the same between drives of one place follows from this one instead:
+            ground, wear, buildings, trees, signs; None takes the seed. Traffic, parked
+            vehicles, light and noise, and the choice of a route, follow from the seed.
         length_m: Of the route; the drive ends early where the lanes do.
         start: Lane id, or ``X,Y`` in the city frame; None is a seeded choice.
         weather, difficulty: What it looks like.
@@ -80,6 +83,7 @@ class SimulationSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    world_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
     length_m: Annotated[float, Field(ge=10, le=1e6)] = 300.0
     start: str | None = None
     weather: Weather = Weather.CLEAR
@@ -94,3 +98,8 @@ class SimulationSettings(BaseModel):
     pose_errors: PoseErrors = PoseErrors()
     calibration_error_m: Annotated[float, Field(ge=0, le=10)] = 0.0
     calibration_error_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+
+    @property
+    def place_seed(self) -> int:
+        """What the place follows from."""
+        return self.seed if self.world_seed is None else self.world_seed

@@ -133,7 +133,7 @@ class SurfaceTiles:
         k = np.arange(TILE_CELLS // repeat)
         x, y = np.meshgrid(corner[0] + (k + 0.5) * step, corner[1] + (k + 0.5) * step)
         xy = np.column_stack([x.ravel(), y.ravel()])
-        seed = self.settings.seed
+        seed = self.settings.place_seed
         noise = 0.75 * value_noise(xy, 22.0, seed, Purpose.GROUND_COVER)
         noise += 0.25 * value_noise(xy, 3.0, seed, Purpose.GROUND_COVER, 1)
         codes = np.full(len(xy), Mat.GRASS, dtype=np.uint8)
@@ -159,13 +159,13 @@ class SurfaceTiles:
         near = shapely.intersection(area.drivable, box.buffer(6.0, join_style="mitre"))
         if near.is_empty:
             return
-        width_m = sidewalk_width(corner, self.settings.seed)
+        width_m = sidewalk_width(corner, self.settings.place_seed)
         if width_m > 0:
             fill_area(codes, near.buffer(KERB_WIDTH_M + width_m), corner, CELL_M, Mat.SIDEWALK)
         fill_area(codes, near.buffer(KERB_WIDTH_M), corner, CELL_M, Mat.KERB)
 
     def _patches(self, codes: NDArrayByte, corner: tuple[float, float], ix: int, iy: int) -> None:
-        seed, chance = self.settings.seed, _PATCHES[self.settings.difficulty]
+        seed, chance = self.settings.place_seed, _PATCHES[self.settings.difficulty]
         cell = 12.8
         quads, covers = [], []
         for cx in range(2 * ix - 1, 2 * ix + 3):
@@ -246,7 +246,7 @@ class SurfaceTiles:
         if len(rows) == 0:
             return
         xy = np.column_stack([cols + 0.5, rows + 0.5]) * CELL_M + corner
-        seed = self.settings.seed
+        seed = self.settings.place_seed
         least, tracks, worn = _WEAR[self.settings.difficulty]
         fine = value_noise(xy, 0.12, seed, Purpose.WEAR)
         middle = value_noise(xy, 0.9, seed, Purpose.WEAR, 1)
@@ -292,7 +292,7 @@ class SurfaceTiles:
                 if at.is_empty or at.geom_type != "Point":
                     continue
                 place = np.array([at.x, at.y])
-                rng = rng_at(self.settings.seed, Purpose.SYMBOL, *np.round(place).astype(int))
+                rng = rng_at(self.settings.place_seed, Purpose.SYMBOL, *np.round(place).astype(int))
                 reached = centre.project(at)
                 if rng.uniform() > 0.6 or reached < 9.0:
                     continue

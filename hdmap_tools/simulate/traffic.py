@@ -71,7 +71,7 @@ def build_actors(
         index: Of the world, where there is one already.
     """
     index = index or WorldIndex(world)
-    terrain = terrain or Terrain(settings.seed, crown=RoadCrown(index))
+    terrain = terrain or Terrain(settings.place_seed, crown=RoadCrown(index))
     last = float(ego_times_s[-1])
     times = np.arange(float(ego_times_s[0]), last + STEP_S, STEP_S)
     arc = np.interp(times, ego_times_s, ego_arc_m)

@@ -123,6 +123,26 @@ def test_scenes_that_overlap_agree(builder, scene) -> None:
     assert distance.max() < 1e-3
 
 
+def test_drives_of_one_place_share_all_but_what_comes_and_goes(scene) -> None:
+    other_day = HARD.model_copy(update={"seed": 77, "world_seed": HARD.seed})
+    same = build_scene(curved_street(), street_route(), (60.0, 110.0), other_day)
+    np.testing.assert_array_equal(same.surface.codes, scene.surface.codes)
+    np.testing.assert_array_equal(same.surface.wear, scene.surface.wear)
+
+    def standing(one: Scene) -> set[tuple[float, ...]]:
+        vehicles_are = [m for m, one in MATERIALS.items() if one.label in ("car", "bus", "truck")]
+        kept = ~np.isin(one.static.materials, vehicles_are)
+        corners = one.static.vertices[one.static.triangles[kept]].mean(axis=1)
+        return {tuple(corner) for corner in np.round(corners, 2).tolist()}
+
+    assert standing(same) == standing(scene)
+    elsewhere = HARD.model_copy(update={"seed": 77})
+    assert not np.array_equal(
+        build_scene(curved_street(), street_route(), (60.0, 110.0), elsewhere).surface.wear,
+        scene.surface.wear,
+    )
+
+
 def test_one_builder_and_a_fresh_one_give_the_same_bytes(builder) -> None:
     fresh = build_scene(curved_street(), street_route(), (100.0, 104.0), HARD)
     used = builder.scene(street_route(), (100.0, 104.0))
