@@ -406,7 +406,10 @@ def build_map(
             "the ground around the vehicle."
         )
     if silent:
-        _LOG.warning("No ground was seen by %s; check their mounts.", ", ".join(silent))
+        why = "check their mounts"
+        if source.methods[0] == "dense":
+            why = "method dense labels only what lies ahead of the vehicle; else check their mounts"
+        _LOG.warning("No ground was seen by %s: %s.", ", ".join(silent), why)
     return maps, counts
 
 
