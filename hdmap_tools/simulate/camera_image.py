@@ -179,7 +179,7 @@ def _sunlight(
         return sunlight
     shape = (camera.height_px, camera.width_px)
     asked = np.zeros(shape, np.bool_)
-    asked[::2, ::2] = asked[1::2, 1::2] = True
+    asked[::2, ::2] = True
     asked = asked.ravel() & (hits.normal @ np.array(light.sun_direction, np.float32) > 0)
     rows = np.flatnonzero(asked & (hits.material != Mat.SKY))
     towards_sun = np.empty((len(rows), 6), np.float32)
