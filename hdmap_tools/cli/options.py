@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from hdmap_tools.config import Config
     from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
 
@@ -230,29 +232,34 @@ def label_cache(cache_folder: Path | None, no_cache: bool) -> LabelCache | None:
     return None if no_cache else LabelCache(cache_folder)
 
 
+def progress_bars(enabled: bool) -> Progress:
+    """Bars on stderr, gone when done, only where a person is watching."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not (enabled and console.is_terminal),
+    )
+
+
 class ImageProgress:
-    """A progress bar over images (or sweeps) on stderr, only where a person is watching."""
+    """A progress bar over images (or sweeps)."""
 
     def __init__(self, enabled: bool, what: str = "images") -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not (enabled and console.is_terminal),
-        )
+        self._progress = progress_bars(enabled)
         self._task = self._progress.add_task(what, total=None)
 
     def __enter__(self) -> SegmentProgress:

@@ -5,7 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hdmap_tools.cli.options import progress_bars
+
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from hdmap_tools.simulate.drive import SimulationProgress
     from hdmap_tools.simulate.settings import SimulationSettings
 
@@ -46,29 +50,10 @@ def _given(document: dict[str, Any]) -> dict[str, Any]:
 
 
 class SimulationProgressBars:
-    """Bars over images and sweeps on stderr, only where a person is watching."""
+    """Bars over what a simulation makes, each from when it is first told of."""
 
     def __init__(self, enabled: bool) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TaskID,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        console = Console(stderr=True)
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not (enabled and console.is_terminal),
-        )
+        self._progress = progress_bars(enabled)
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> SimulationProgress:

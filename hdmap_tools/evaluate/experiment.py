@@ -34,7 +34,6 @@ from hdmap_tools.evaluate.methods import (
     OUR_MAP,
     OUR_METHODS,
     OURS,
-    PAPER_MAP,
     PAPER_METHODS,
     Method,
     band_name,
@@ -268,18 +267,19 @@ def _scored(
         m.name: _model(m, maps[m.map_name].meta, learned)
         for m in (*PAPER_METHODS, *OUR_METHODS, *MODE_METHODS)
     }
+    windows = {
+        method.name: read_window(maps[method.map_name], grid, models[method.name], 1)
+        for method in (*PAPER_METHODS, *OUR_METHODS, *MODE_METHODS)
+    }
     # Compared is what the drive could see: cells with a point that fell into an image.
-    seen = read_window(maps[PAPER_MAP], grid, models["CFN"], 0)
-    mask = np.asarray(seen.dataset["observations"].values > 0)
-    methods, windows = {}, {}
+    mask = _has_votes(windows["CFN"])
+    methods = {}
     for method in (*PAPER_METHODS, *OUR_METHODS, *MODE_METHODS):
-        window = read_window(maps[method.map_name], grid, models[method.name], 1)
-        bare = read_window(maps[method.map_name], grid, models[method.name], 0)
-        windows[method.name] = window
+        window = windows[method.name]
         weights = learned.decision if method.uses_decision else {}
         methods[method.name] = MethodScores(
             filled=_scores(window, shares, mask, weights=weights),
-            unfilled=_scores(bare, shares, mask, weights=weights),
+            unfilled=_scores(window, shares, mask, weights=weights, with_filled=False),
             any_paint=_scores(window, shares, mask, ANY_PAINT, weights),
         )
     by_range, by_terrain = _by_place(drive, config, grid, maps, models["CFN"], shares, poses)
@@ -351,14 +351,23 @@ def _where_known(window: MapWindow, shares: NDArrayFloat, mask: NDArrayBool) -> 
     return _scores(window, shares, mask & known).model_copy(update={"coverage": coverage})
 
 
+def _has_votes(window: MapWindow) -> NDArrayBool:
+    """(y, x) bool: cells with votes of their own, not filled from their neighbours."""
+    return np.asarray(window.dataset["observations"].values > 0)
+
+
 def _scores(
     window: MapWindow,
     shares: NDArrayFloat,
     mask: NDArrayBool,
     paint_share: float = PAINT_SHARE,
     weights: dict[str, float] | None = None,
+    *,
+    with_filled: bool = True,
 ) -> PaperScores:
     posterior = weighted(window.dataset["posterior"].values, window.classes, weights or {})
+    if not with_filled:
+        posterior[:, ~_has_votes(window)] = np.nan
     return paper_scores(posterior, window.classes, shares, _NAMES, mask, paint_share=paint_share)
 
 
