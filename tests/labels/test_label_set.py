@@ -26,6 +26,7 @@ SHIPPED = (
     "cityscapes-ids",
     "mapillary-vistas-66",
     "paz2020",
+    "street",
     "waymo-panoptic",
 )
 

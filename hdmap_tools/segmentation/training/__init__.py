@@ -1,0 +1,1 @@
+"""Training a network of labels: image and label pairs, augmentation, training, export."""
