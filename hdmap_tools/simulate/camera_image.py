@@ -136,6 +136,7 @@ def _shaded(
         shade(
             first,
             last,
+            camera.width_px,
             rays,
             hits.t,
             hits.material,
@@ -158,7 +159,7 @@ def _shaded(
             image,
         )
 
-    in_bands(shade_band, len(rays))
+    in_bands(shade_band, camera.height_px)
     return image
 
 

@@ -64,7 +64,11 @@ def simulate_drive(
         truth = log / truth_files.TRUTH_FOLDER
         _write_tables(log, truth, plan, world_path)
         Recorder(
-            log, truth, plan, lambda told: _write_true_map(truth, plan, told), progress
+            log,
+            truth,
+            plan,
+            (lambda told: _write_true_map(truth, plan, told)) if settings.true_map else None,
+            progress,
         ).record()
     return out
 
@@ -83,7 +87,7 @@ def _write_tables(log: Path, truth: Path, plan: DrivePlan, world_path: Path) -> 
     write_log.write_calibration(
         log,
         [replace(c, ego_SE3_cam=given(c.ego_SE3_cam, c.name)) for c in plan.cameras],
-        given(plan.lidar.ego_SE3_lidar, plan.lidar.name),
+        given(plan.lidar.ego_SE3_lidar, plan.lidar.name) if plan.lidar is not None else None,
     )
     write_log.write_map_frame(log, plan.world.frame)
     write_log_map(log, plan.log_id, plan.world, plan.route.xy, plan.builder.terrain.height_at)

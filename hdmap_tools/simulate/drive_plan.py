@@ -15,7 +15,7 @@ from hdmap_tools.simulate.build_scene import SceneBuilder
 from hdmap_tools.simulate.route import Route, motion_along, places_along, plan_route
 from hdmap_tools.simulate.scene import Actor
 from hdmap_tools.simulate.sensor_rigs import LidarModel, cameras_of, lidar_of
-from hdmap_tools.simulate.settings import SimulationSettings
+from hdmap_tools.simulate.settings import LidarPreset, SimulationSettings
 from hdmap_tools.simulate.traffic import build_actors
 from hdmap_tools.simulate.vehicle_motion import vehicle_trajectory
 from hdmap_tools.simulate.world_map import WorldMap
@@ -56,7 +56,7 @@ class DrivePlan:
         start_ns: Time of second 0.
         times_s, arc_m: (K,) when the vehicle is how far along the route.
         city_SE3_ego: True poses, at `POSE_HZ` and at the time of every shot.
-        cameras, lidar: With their true mounts.
+        cameras, lidar: With their true mounts; the lidar None where there is none.
         shots: What the sensors do, by time.
     """
 
@@ -70,7 +70,7 @@ class DrivePlan:
     arc_m: NDArrayFloat
     city_SE3_ego: Trajectory
     cameras: tuple[PinholeCamera, ...]
-    lidar: LidarModel
+    lidar: LidarModel | None
     shots: tuple[Shot, ...]
 
     @property
@@ -95,7 +95,8 @@ class DrivePlan:
         for shot in self.shots:
             shots[min(int(self.arc_at(shot.timestamp_ns) / length), count - 1)].append(shot)
         # The turn of a sweep that begins on a stretch may end beyond it.
-        reach = self.settings.speed_mps * self.lidar.turn_ns / 1e9
+        turn_s = self.lidar.turn_ns / 1e9 if self.lidar is not None else 0.0
+        reach = self.settings.speed_mps * turn_s
         return [
             ((k * length, min((k + 1) * length + reach, self.route.length_m)), shots[k])
             for k in range(count)
@@ -113,14 +114,22 @@ def plan_drive(world: WorldMap, settings: SimulationSettings) -> DrivePlan:
     route = plan_route(world, settings.length_m, settings.start, settings.seed)
     builder = SceneBuilder(world, settings)
     terrain = builder.terrain
-    cameras = cameras_of(settings.camera_rig, settings.image_width_px, settings.image_height_px)
-    lidar = lidar_of(settings.lidar, settings.lidar_hz, settings.seed)
+    cameras = cameras_of(
+        settings.camera_rig,
+        settings.image_width_px,
+        settings.image_height_px,
+        settings.camera_height_m,
+    )
+    lidar = None
+    if settings.lidar != LidarPreset.NONE:
+        lidar = lidar_of(settings.lidar, settings.lidar_hz, settings.seed)
     start_ns = start_time_ns(settings.seed)
     times_s, arc_m = motion_along(route, settings.speed_mps, POSE_HZ)
     knots_ns = start_ns + np.round(times_s * 1e9).astype(np.int64)
     xy, yaw_rad = places_along(route, arc_m)
     moved = vehicle_trajectory(knots_ns, xy, yaw_rad, terrain.height_at)
-    shots = planned_shots(settings, len(cameras), lidar.turn_ns, start_ns, int(knots_ns[-1]))
+    turn_ns = lidar.turn_ns if lidar is not None else None
+    shots = planned_shots(settings, len(cameras), turn_ns, start_ns, int(knots_ns[-1]))
     if not shots:
         raise WorldError(
             f"The drive through {world.name} takes {times_s[-1]:.2f} s, in which no camera and no "
@@ -152,20 +161,25 @@ def start_time_ns(seed: int) -> int:
 
 
 def planned_shots(
-    settings: SimulationSettings, num_cameras: int, turn_ns: int, start_ns: int, end_ns: int
+    settings: SimulationSettings,
+    num_cameras: int,
+    turn_ns: int | None,
+    start_ns: int,
+    end_ns: int,
 ) -> tuple[Shot, ...]:
     """Images and sweeps by time; each camera has a phase of its own, sweeps follow each other.
 
     Args:
         settings: The rates.
         num_cameras: Of the rig.
-        turn_ns: Time of one sweep.
+        turn_ns: Time of one sweep; None is no lidar, so no sweeps.
         start_ns: When the drive begins.
         end_ns: When it ends; a sweep whose turn is not over then is left out.
     """
-    shots = [
-        Shot(start_ns + k * turn_ns, None, k) for k in range(int((end_ns - start_ns) // turn_ns))
-    ]
+    shots: list[Shot] = []
+    if turn_ns is not None:
+        count = int((end_ns - start_ns) // turn_ns)
+        shots += [Shot(start_ns + k * turn_ns, None, k) for k in range(count)]
     step_ns = 1e9 / settings.camera_hz
     for camera in range(num_cameras):
         first_ns = step_ns * (camera + 0.5) / num_cameras

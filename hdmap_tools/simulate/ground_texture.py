@@ -14,7 +14,7 @@ import numpy as np
 
 from hdmap_tools.simulate.materials import MATERIALS, Mat
 from hdmap_tools.simulate.scene import SurfaceRaster
-from hdmap_tools.types import NDArrayByte, NDArrayFloat32, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayFloat32, NDArrayInt
 
 NUM_LEVELS: Final = 8
 PAINTS: Final = (
@@ -33,17 +33,17 @@ class GroundTexture:
 
     Attributes:
         albedo: (256, 3) float32 linear, by material.
-        cells: (65536, 3) float32 the same by 256 times material plus wear: paint as far as it
-            is left, on asphalt.
-        pyramid: (B,) uint8: one after the other the levels, of cells 2, 4, 8 … times the
-            raster's, each (rows, cols, 3): the square root of linear albedo times 255, for
-            finer steps where it is dark.
+        cells: (65536,) uint32 texels by 256 times material plus wear: paint as far as it
+            is left, on asphalt. Red, green and blue are ten bits each, red lowest, of linear
+            albedo.
+        pyramid: (B,) uint32: one after the other the levels, of cells 2, 4, 8 … times the
+            raster's, each (rows, cols) texels.
         level_shapes: (L, 3) where in `pyramid` each level begins, its rows, its columns.
     """
 
     albedo: NDArrayFloat32
-    cells: NDArrayFloat32
-    pyramid: NDArrayByte
+    cells: NDArrayAny
+    pyramid: NDArrayAny
     level_shapes: NDArrayInt
 
 
@@ -55,13 +55,16 @@ def albedo_table() -> NDArrayFloat32:
     return table
 
 
-def _worn(albedo: NDArrayFloat32) -> NDArrayFloat32:
+def _worn(albedo: NDArrayFloat32) -> NDArrayAny:
+    from hdmap_tools.simulate.texture_kernels import FULL
+
     cells = np.repeat(albedo, 256, axis=0).reshape(256, 256, 3)
     left = np.linspace(0.0, 1.0, 256, dtype=np.float32)[:, None]
     for mat in PAINTS:
         cells[mat] = left * albedo[mat] + (1 - left) * albedo[Mat.ASPHALT]
     cells[Mat.GROUND] = albedo[Mat.GRASS]
-    return cells.reshape(-1, 3)
+    steps = np.rint(FULL * cells.reshape(-1, 3)).astype(np.uint32)
+    return np.asarray(steps[:, 0] | steps[:, 1] << 10 | steps[:, 2] << 20)
 
 
 def ground_texture(surface: SurfaceRaster) -> GroundTexture:
@@ -77,9 +80,9 @@ def ground_texture(surface: SurfaceRaster) -> GroundTexture:
     for _ in range(NUM_LEVELS):
         rows, cols = (rows + 1) // 2, (cols + 1) // 2
         shapes.append((start, rows, cols))
-        start += 3 * rows * cols
-    pyramid = np.empty(start, np.uint8)
-    levels = [pyramid[s : s + 3 * r * c].reshape(r, c, 3) for s, r, c in shapes]
+        start += rows * cols
+    pyramid = np.empty(start, np.uint32)
+    levels = [pyramid[s : s + r * c].reshape(r, c) for s, r, c in shapes]
     in_bands(
         lambda first, last: first_level(first, last, surface.codes, surface.wear, cells, levels[0]),
         len(levels[0]),

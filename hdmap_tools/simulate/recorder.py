@@ -25,6 +25,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.simulate import truth_files, write_log
 from hdmap_tools.simulate.camera_image import prepare_textures, render_image
 from hdmap_tools.simulate.drive_plan import DrivePlan, Shot
@@ -55,7 +56,8 @@ class Recorder:
         truth: Folder of its truth.
         plan: The drive.
         write_true_map: Told how to report tiles done and their number. It runs in the thread
-            that builds the scenes: what they share is made and kept by one thread only.
+            that builds the scenes: what they share is made and kept by one thread only. None
+            writes none.
         progress: Told about tiles, images and sweeps.
     """
 
@@ -64,7 +66,7 @@ class Recorder:
         log: Path,
         truth: Path,
         plan: DrivePlan,
-        write_true_map: Callable[[Callable[[int, int], None]], None],
+        write_true_map: Callable[[Callable[[int, int], None]], None] | None,
         progress: SimulationProgress | None,
     ) -> None:
         self._log, self._truth, self._plan = log, truth, plan
@@ -75,16 +77,7 @@ class Recorder:
         self._done = dict.fromkeys(self._total, 0)
         self._tiles = (0, 0)
         self._look = CameraLook(plan.settings.weather, plan.settings.difficulty, plan.settings.seed)
-        error = disturbed_mount(
-            plan.lidar.ego_SE3_lidar,
-            plan.lidar.name,
-            plan.settings.calibration_error_m,
-            plan.settings.calibration_error_deg,
-            plan.settings.seed,
-        )
-        # Points are handed out in the ego frame, to which the given mount took them.
-        self._given_SE3_ego = error @ plan.lidar.ego_SE3_lidar.inverse()
-        self._is_exact = error is plan.lidar.ego_SE3_lidar
+        self._given_SE3_ego = _given_SE3_ego(plan)
         self._stopped = Event()
 
     def record(self) -> None:
@@ -101,7 +94,11 @@ class Recorder:
         ):
             try:
                 scene = builder.submit(self._build, *stretches[0])
-                true_map = builder.submit(self._write_true_map, self._tiles_done)
+                if self._write_true_map is None:
+                    true_map: Future[None] = Future()
+                    true_map.set_result(None)
+                else:
+                    true_map = builder.submit(self._write_true_map, self._tiles_done)
                 for k, (_, shots) in enumerate(stretches):
                     caster = scene.result()
                     if true_map.done():
@@ -169,6 +166,7 @@ class Recorder:
 
     def _take_sweep(self, caster: RayCaster, shot: Shot) -> None:
         plan = self._plan
+        assert plan.lidar is not None  # who has no lidar has no sweeps to take
         sweep = scan_sweep(
             caster,
             plan.lidar,
@@ -179,7 +177,7 @@ class Recorder:
             drive_start_ns=plan.start_ns,
         )
         points = sweep.points_ego
-        if not self._is_exact:
+        if self._given_SE3_ego is not None:
             points = self._given_SE3_ego.transform_from(points.astype(np.float64)).astype(
                 np.float32
             )
@@ -205,6 +203,24 @@ class Recorder:
             self._progress("tiles", *self._tiles)
         for what, done in self._done.items():
             self._progress(what, done, self._total[what])
+
+
+def _given_SE3_ego(plan: DrivePlan) -> SE3 | None:
+    """From true points in the ego frame to those that a given, wrong mount makes of them.
+
+    None where the mount that is given is the true one.
+    """
+    if plan.lidar is None:
+        return None
+    mount = plan.lidar.ego_SE3_lidar
+    error = disturbed_mount(
+        mount,
+        plan.lidar.name,
+        plan.settings.calibration_error_m,
+        plan.settings.calibration_error_deg,
+        plan.settings.seed,
+    )
+    return error @ mount.inverse() if error is not mount else None
 
 
 def _seed_of(seed: int, sensor: int, number: int) -> int:

@@ -20,7 +20,6 @@ GROUND_Z_EGO_M: Final = -0.33
 """Height of level ground in the ego frame: the radius of the loaded rear wheel, as in
 Argoverse 2's calibrations."""
 
-CAMERA_HEIGHT_M: Final = 1.55
 LIDAR_HEIGHT_M: Final = 1.9
 """Over the ground."""
 
@@ -52,18 +51,21 @@ _PITCH_DEG: Final = 2.0
 """Downwards: a little less sky."""
 
 
-def cameras_of(rig: CameraRig, width_px: int = 960, height_px: int = 600) -> list[PinholeCamera]:
+def cameras_of(
+    rig: CameraRig, width_px: int = 960, height_px: int = 600, height_m: float = 1.55
+) -> list[PinholeCamera]:
     """The cameras of a rig; names are Argoverse 2's, images are rectified, pixels square.
 
     Args:
         rig: Which cameras.
         width_px: Of each image; its horizontal field of view is 70 degrees.
         height_px: Of each image.
+        height_m: Of each camera over the ground.
     """
-    return [_camera(name, width_px, height_px) for name in _RIGS[rig]]
+    return [_camera(name, width_px, height_px, height_m) for name in _RIGS[rig]]
 
 
-def _camera(name: str, width_px: int, height_px: int) -> PinholeCamera:
+def _camera(name: str, width_px: int, height_px: int, height_m: float) -> PinholeCamera:
     x, y, heading_deg = _MOUNTS[name]
     focal_px = width_px / 2 / np.tan(np.radians(_FIELD_OF_VIEW_DEG / 2))
     # Camera axes (right, down, ahead) of a camera that looks along the ego's x.
@@ -85,7 +87,7 @@ def _camera(name: str, width_px: int, height_px: int) -> PinholeCamera:
         fy=focal_px,
         cx=(width_px - 1) / 2,
         cy=(height_px - 1) / 2,
-        ego_SE3_cam=SE3(rotation, np.array([x, y, CAMERA_HEIGHT_M + GROUND_Z_EGO_M])),
+        ego_SE3_cam=SE3(rotation, np.array([x, y, height_m + GROUND_Z_EGO_M])),
     )
 
 

@@ -35,8 +35,9 @@ class CameraRig(StrEnum):
 
 
 class LidarPreset(StrEnum):
-    """Ring geometries."""
+    """Ring geometries; ``none``: a vehicle without a lidar, for pictures alone."""
 
+    NONE = "none"
     VLP16 = "vlp16"
     RINGS32 = "rings32"
     RINGS64 = "rings64"
@@ -72,12 +73,15 @@ class SimulationSettings(BaseModel):
         start: Lane id, or ``X,Y`` in the city frame; None is a seeded choice.
         weather, difficulty: What it looks like.
         camera_rig, lidar: The sensors.
+        camera_height_m: Of all cameras, over the ground.
         image_width_px, image_height_px: Of each camera.
         camera_hz, lidar_hz: Rates.
         speed_mps: On straight roads; curves are taken slower.
         pose_errors: Of the poses that are written; `truth/` keeps the true ones.
         calibration_error_m, calibration_error_deg: One sigma of each axis of each mount
             that is written.
+        true_map: Whether the class raster and the vector map of what was seen are written;
+            who wants images and their labels alone saves a fifth of the time.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -89,6 +93,7 @@ class SimulationSettings(BaseModel):
     weather: Weather = Weather.CLEAR
     difficulty: Difficulty = Difficulty.DEFAULT
     camera_rig: CameraRig = CameraRig.FRONT
+    camera_height_m: Annotated[float, Field(ge=0.5, le=4.0)] = 1.55
     lidar: LidarPreset = LidarPreset.RINGS32
     image_width_px: Annotated[int, Field(ge=64, le=4096)] = 960
     image_height_px: Annotated[int, Field(ge=64, le=4096)] = 600
@@ -98,6 +103,7 @@ class SimulationSettings(BaseModel):
     pose_errors: PoseErrors = PoseErrors()
     calibration_error_m: Annotated[float, Field(ge=0, le=10)] = 0.0
     calibration_error_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+    true_map: bool = True
 
     @property
     def place_seed(self) -> int:

@@ -53,7 +53,7 @@ def simulation_document(
     route: Route,
     settings: SimulationSettings,
     cameras: Sequence[PinholeCamera],
-    lidar: LidarModel,
+    lidar: LidarModel | None,
 ) -> dict[str, Any]:
     """How the drive was made: settings, world, route, and the true calibration."""
     return {
@@ -68,7 +68,7 @@ def simulation_document(
         "label_set": LABEL_SET,
         "ego_SE3_sensor": {
             **{camera.name: camera.ego_SE3_cam.matrix.tolist() for camera in cameras},
-            lidar.name: lidar.ego_SE3_lidar.matrix.tolist(),
+            **({lidar.name: lidar.ego_SE3_lidar.matrix.tolist()} if lidar is not None else {}),
         },
         "intrinsics": {camera.name: camera.matrix.tolist() for camera in cameras},
     }

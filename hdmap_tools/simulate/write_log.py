@@ -38,14 +38,19 @@ def write_poses(log: Path, city_SE3_ego: Trajectory) -> None:
     )
 
 
-def write_calibration(log: Path, cameras: Sequence[PinholeCamera], ego_SE3_lidar: SE3) -> None:
+def write_calibration(
+    log: Path, cameras: Sequence[PinholeCamera], ego_SE3_lidar: SE3 | None
+) -> None:
     """``calibration/``: mounts of all sensors, intrinsics of the cameras (rectified: no lens)."""
-    mounts = [camera.ego_SE3_cam for camera in cameras] + [ego_SE3_lidar] * len(LIDAR_MOUNTS)
     names = [camera.name for camera in cameras]
+    mounts = [camera.ego_SE3_cam for camera in cameras]
+    lidars = LIDAR_MOUNTS if ego_SE3_lidar is not None else ()
+    if ego_SE3_lidar is not None:
+        mounts += [ego_SE3_lidar] * len(lidars)
     _write_feather(
         log / "calibration" / "egovehicle_SE3_sensor.feather",
         {
-            "sensor_name": np.array([*names, *LIDAR_MOUNTS], dtype=object),
+            "sensor_name": np.array([*names, *lidars], dtype=object),
             **_pose_columns(
                 np.array([mount.quaternion_wxyz for mount in mounts]),
                 np.array([mount.translation for mount in mounts]),
