@@ -350,3 +350,41 @@ def test_names_of_the_log_do_not_depend_on_its_folder_and_hold_no_odd_characters
     world = replace(read_world(shipped_world()), name="Straße / 1 ____ x")
     plan = plan_drive(world, TINY)
     assert plan.log_id == "Stra-e-1-x-5"
+
+
+def test_images_alone_are_those_of_the_whole_drive(tmp_path):
+    whole = simulate_drive(shipped_world(), tmp_path / "whole", TINY)
+    settings = TINY.model_copy(update={"lidar": LidarPreset.NONE, "true_map": False})
+    alone = simulate_drive(shipped_world(), tmp_path / "alone", settings)
+    for folder in ("sensors/cameras", "truth/label_images"):
+        assert bytes_of(alone / folder) == bytes_of(whole / folder)
+    assert bytes_of(whole / "sensors" / "lidar")
+    assert {p.name for p in (alone / "sensors").iterdir()} == {"cameras"}
+    assert {p.name for p in (alone / "truth").iterdir()} == {
+        "city_SE3_egovehicle.feather",
+        "label_images",
+        "simulation.json",
+    }
+    drive = read_av2(alone)
+    assert len(drive.images) >= 1
+    assert drive.sweeps == ()
+    document = json.loads((alone / "truth" / "simulation.json").read_text())
+    assert set(document["ego_SE3_sensor"]) == set(drive.cameras)
+
+
+def test_no_image_and_no_lidar_is_refused(tmp_path):
+    settings = TINY.model_copy(update={"lidar": LidarPreset.NONE, "camera_hz": 0.01})
+    with pytest.raises(WorldError, match="no camera and no lidar"):
+        simulate_drive(shipped_world(), tmp_path / "nothing", settings)
+
+
+def test_cameras_ride_as_high_as_asked():
+    world = read_world(shipped_world())
+    low, high = (
+        plan_drive(world, TINY.model_copy(update={"camera_height_m": height})).cameras[0]
+        for height in (1.2, 2.4)
+    )
+    np.testing.assert_allclose(
+        high.ego_SE3_cam.translation - low.ego_SE3_cam.translation, [0.0, 0.0, 1.2], atol=1e-12
+    )
+    np.testing.assert_array_equal(high.ego_SE3_cam.rotation, low.ego_SE3_cam.rotation)
