@@ -7,14 +7,32 @@ from functools import lru_cache
 from typing import Final
 
 from hdmap_tools.errors import LabelError
+from hdmap_tools.labels import street
+from hdmap_tools.labels.camvid import CAMVID, CAMVID_TO_PAZ2020
+from hdmap_tools.labels.cityscapes import (
+    CITYSCAPES,
+    CITYSCAPES_IDS,
+    CITYSCAPES_IDS_TO_PAZ2020,
+    CITYSCAPES_TO_PAZ2020,
+)
 from hdmap_tools.labels.label_mapping import LabelMapping, identity_mapping
 from hdmap_tools.labels.label_set import LabelSet, load_label_set
-from hdmap_tools.labels.street import PAZ2020_TO_STREET, STREET
+from hdmap_tools.labels.street import STREET
 from hdmap_tools.labels.vistas import PAZ2020, VISTAS, VISTAS_TO_PAZ2020
+from hdmap_tools.labels.vistas_v2 import VISTAS_V2, VISTAS_V2_TO_PAZ2020
 
 _FATES: Final[Mapping[tuple[str, str], Mapping[str, str | None]]] = {
     (VISTAS, PAZ2020): VISTAS_TO_PAZ2020,
-    (PAZ2020, STREET): PAZ2020_TO_STREET,
+    (VISTAS, STREET): street.VISTAS_TO_STREET,
+    (VISTAS_V2, PAZ2020): VISTAS_V2_TO_PAZ2020,
+    (VISTAS_V2, STREET): street.VISTAS_V2_TO_STREET,
+    (CITYSCAPES_IDS, PAZ2020): CITYSCAPES_IDS_TO_PAZ2020,
+    (CITYSCAPES_IDS, STREET): street.CITYSCAPES_IDS_TO_STREET,
+    (CITYSCAPES, PAZ2020): CITYSCAPES_TO_PAZ2020,
+    (CITYSCAPES, STREET): street.CITYSCAPES_TO_STREET,
+    (CAMVID, PAZ2020): CAMVID_TO_PAZ2020,
+    (CAMVID, STREET): street.CAMVID_TO_STREET,
+    (PAZ2020, STREET): street.PAZ2020_TO_STREET,
 }
 
 

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from hdmap_tools.errors import LabelError
-from hdmap_tools.labels.label_set import IGNORE_ID, load_label_set
+from hdmap_tools.labels.label_mapping import LabelMapping
+from hdmap_tools.labels.label_set import load_label_set
 from hdmap_tools.types import NDArrayByte
 
 VISTAS: Final = "mapillary-vistas-66"
@@ -96,18 +97,6 @@ dropped, not guessed at.
 """
 
 
-@lru_cache
-def _table() -> NDArrayByte:
-    vistas, paz2020 = load_label_set(VISTAS), load_label_set(PAZ2020)
-    table = np.full(256, IGNORE_ID, dtype=np.uint8)
-    for label in vistas.labels:
-        target = VISTAS_TO_PAZ2020[label.name]
-        if target is not None:
-            table[label.id] = paz2020.id_of(target)
-    table.setflags(write=False)
-    return table
-
-
 def remap_vistas_to_paz2020(
     label_image: NDArrayByte, what: str = "The Vistas label image"
 ) -> NDArrayByte:
@@ -129,5 +118,9 @@ def remap_vistas_to_paz2020(
             f"{what} holds {label_image.dtype}, expected uint8 ids; of a 16-bit instance image "
             "take value // 256 first."
         )
-    load_label_set(VISTAS).check(label_image, what)
-    return _table()[label_image]
+    return _mapping().apply(label_image, what)
+
+
+@lru_cache
+def _mapping() -> LabelMapping:
+    return LabelMapping(load_label_set(VISTAS), load_label_set(PAZ2020), VISTAS_TO_PAZ2020)

@@ -22,8 +22,10 @@ from hdmap_tools.labels.label_set import (
 
 SHIPPED = (
     "adas-0001",
+    "camvid-11",
     "cityscapes",
     "cityscapes-ids",
+    "mapillary-vistas-124",
     "mapillary-vistas-66",
     "paz2020",
     "street",
