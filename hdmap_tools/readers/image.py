@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -42,29 +43,42 @@ def read_image(ref: ImageRef, camera: PinholeCamera) -> NDArrayByte:
         ImageError: If the file is missing, empty, truncated, does not decode, or
             has another size than the camera.
     """
-    try:
-        encoded = ref.path.read_bytes()
-    except OSError as error:
-        raise ImageError(
-            f"Image {ref.path} cannot be read ({error.strerror or error}); expected the image of "
-            f"camera {ref.camera} at {ref.timestamp_ns} ns."
-        ) from error
-    damage = find_damage(encoded)
-    if damage is not None:
-        raise ImageError(
-            f"Image {ref.path} is damaged: {damage}. Copy it again or remove it from the drive."
-        )
-    image = _decode(encoded)
-    if image is None:
-        raise ImageError(
-            f"Image {ref.path} does not decode ({len(encoded)} bytes, starts with "
-            f"{encoded[:8].hex(' ')}); expected a JPEG or PNG. Copy it again or remove it."
-        )
+    image = read_rgb(ref.path, f"the image of camera {ref.camera} at {ref.timestamp_ns} ns")
     height, width = image.shape[:2]
     if (width, height) != (camera.width_px, camera.height_px):
         raise ImageError(
             f"Image {ref.path} is {width}x{height} px, but camera {ref.camera} is calibrated for "
             f"{camera.width_px}x{camera.height_px} px; use the images the calibration was made for."
+        )
+    return image
+
+
+def read_rgb(path: Path, expected: str = "a JPEG or PNG") -> NDArrayByte:
+    """Any image file as (H, W, 3) uint8 RGB, in the orientation that its pixels are stored in.
+
+    Args:
+        path: The file.
+        expected: What was looked for there, for the message where it cannot be read.
+
+    Raises:
+        ImageError: If the file is missing, empty, truncated or does not decode.
+    """
+    try:
+        encoded = path.read_bytes()
+    except OSError as error:
+        raise ImageError(
+            f"Image {path} cannot be read ({error.strerror or error}); expected {expected}."
+        ) from error
+    damage = find_damage(encoded)
+    if damage is not None:
+        raise ImageError(
+            f"Image {path} is damaged: {damage}. Copy it again or remove it from the drive."
+        )
+    image = _decode(encoded)
+    if image is None:
+        raise ImageError(
+            f"Image {path} does not decode ({len(encoded)} bytes, starts with "
+            f"{encoded[:8].hex(' ')}); expected a JPEG or PNG. Copy it again or remove it."
         )
     return image
 
