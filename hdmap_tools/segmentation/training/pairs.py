@@ -1,146 +1,75 @@
-"""Pairs of a camera image and its label image: what a network learns from and is judged on."""
+"""The door to labelled images: every data set by a function, and all by one line of text."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import accumulate
-from typing import Protocol
+from pathlib import Path
+from typing import Final
 
-from hdmap_tools.errors import LabelError
-from hdmap_tools.labels.label_mapping import LabelMapping
-from hdmap_tools.labels.label_set import LabelSet
-from hdmap_tools.labels.mappings import mapping_to
-from hdmap_tools.types import NDArrayByte
+from hdmap_tools.errors import ConfigError
+from hdmap_tools.segmentation.training.camvid_folder import open_camvid
+from hdmap_tools.segmentation.training.cityscapes_folder import open_cityscapes
+from hdmap_tools.segmentation.training.drive_pairs import open_drives
+from hdmap_tools.segmentation.training.image_pairs import ImagePairs, joined, relabelled
+from hdmap_tools.segmentation.training.labelled_files import LabelledFiles
+from hdmap_tools.segmentation.training.vistas_folder import open_vistas
 
+SPEC_HELP: Final = (
+    "drive:FOLDER[:LABELS], vistas:FOLDER[:SPLIT], vistas-v2:FOLDER[:SPLIT], "
+    "cityscapes:FOLDER[:SPLIT] or camvid:FOLDER[:SPLIT]; FOLDER alone is a drive"
+)
+"""How data is named on the command line."""
 
-class ImagePairs(Protocol):
-    """Images with their labels, read one at a time.
-
-    Picklable and without open files, so that worker processes may read them.
-    """
-
-    @property
-    def name(self) -> str:
-        """Names the data in logs and in what is kept with a trained model."""
-        ...
-
-    @property
-    def label_set(self) -> LabelSet:
-        """What the ids mean."""
-        ...
-
-    def __len__(self) -> int:
-        """Number of pairs."""
-        ...
-
-    def read(self, index: int) -> tuple[NDArrayByte, NDArrayByte]:
-        """One pair: rgb (h, w, 3) uint8 and ids (h, w) uint8, 255 where nothing is judged.
-
-        Raises:
-            ImageError: If a file is missing, damaged, or the two differ in size; the
-                message names the files.
-            LabelError: If an id is outside the label set.
-        """
-        ...
-
-    def describe(self, index: int) -> str:
-        """The files of a pair, for messages."""
-        ...
+_KINDS: Final = ("drive", "vistas", "vistas-v2", "cityscapes", "camvid")
 
 
-@dataclass(frozen=True)
-class _Relabelled:
-    """Pairs whose labels are brought onto another set."""
-
-    pairs: ImagePairs
-    mapping: LabelMapping
-
-    @property
-    def name(self) -> str:
-        return self.pairs.name
-
-    @property
-    def label_set(self) -> LabelSet:
-        return self.mapping.target
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def read(self, index: int) -> tuple[NDArrayByte, NDArrayByte]:
-        rgb, ids = self.pairs.read(index)
-        return rgb, self.mapping.table[ids]
-
-    def describe(self, index: int) -> str:
-        return self.pairs.describe(index)
-
-
-@dataclass(frozen=True)
-class _Joined:
-    """Several sources one after another."""
-
-    parts: tuple[ImagePairs, ...]
-
-    @cached_property
-    def _ends(self) -> list[int]:
-        return list(accumulate(len(part) for part in self.parts))
-
-    @property
-    def name(self) -> str:
-        return " + ".join(part.name for part in self.parts)
-
-    @property
-    def label_set(self) -> LabelSet:
-        return self.parts[0].label_set
-
-    def __len__(self) -> int:
-        return self._ends[-1]
-
-    def read(self, index: int) -> tuple[NDArrayByte, NDArrayByte]:
-        part, within = self._find(index)
-        return part.read(within)
-
-    def describe(self, index: int) -> str:
-        part, within = self._find(index)
-        return part.describe(within)
-
-    def _find(self, index: int) -> tuple[ImagePairs, int]:
-        if not 0 <= index < len(self):
-            raise IndexError(f"There are {len(self)} pairs, asked for number {index}.")
-        which = bisect_right(self._ends, index)
-        return self.parts[which], index - (self._ends[which - 1] if which else 0)
-
-
-def relabelled(pairs: ImagePairs, target: str | LabelSet) -> ImagePairs:
-    """The same pairs with their labels brought onto another set.
+def open_pairs(spec: str) -> ImagePairs:
+    """Labelled images by a line of text, as on the command line.
 
     Args:
-        pairs: In a label set that a mapping to the target is known of.
-        target: The set or the name of a shipped one.
+        spec: ``drive:FOLDER``, a drive or a folder of simulated ones;
+            ``drive:FOLDER:LABELS``, with its label images elsewhere;
+            ``vistas:FOLDER:SPLIT``, ``vistas-v2:FOLDER:SPLIT``,
+            ``cityscapes:FOLDER:SPLIT``, ``camvid:FOLDER:SPLIT``, the split being the one
+            for training when it is left out; or a folder alone, which is a drive.
 
     Raises:
-        LabelError: If no mapping between the two sets is known; the message lists them.
+        ConfigError: If the kind of data is unknown, or a folder is missing or empty.
+        DriveError: If a drive cannot be read.
+        ImageError: If an image has no label file.
+        LabelError: If the label ids' meaning is not known.
     """
-    mapping = mapping_to(pairs.label_set, target)
-    return pairs if mapping.target == pairs.label_set else _Relabelled(pairs, mapping)
+    kind, colon, rest = spec.partition(":")
+    if kind not in _KINDS:
+        if colon and not Path(spec).exists():
+            raise ConfigError(f"{spec!r} names no data: {kind!r} is unknown; expected {SPEC_HELP}.")
+        kind, rest = "drive", spec
+    if not rest:
+        raise ConfigError(f"{spec!r} names no folder; expected {SPEC_HELP}.")
+    folder, _, second = rest.rpartition(":")
+    if not folder or Path(rest).exists():
+        folder, second = rest, ""
+    match kind:
+        case "vistas":
+            return open_vistas(folder, second or "training", "1.2")
+        case "vistas-v2":
+            return open_vistas(folder, second or "training", "2.0")
+        case "cityscapes":
+            return open_cityscapes(folder, second or "train")
+        case "camvid":
+            return open_camvid(folder, second or "train")
+        case _:
+            return open_drives([folder], second or None)
 
 
-def joined(parts: Sequence[ImagePairs]) -> ImagePairs:
-    """Several sources as one, in the order given.
-
-    Raises:
-        LabelError: If there is none, or their label sets differ: bring them onto one
-            with `relabelled` first.
-    """
-    if not parts:
-        raise LabelError("There are no images to train on; name at least one source.")
-    first = parts[0]
-    for part in parts:
-        if part.label_set.names != first.label_set.names:
-            raise LabelError(
-                f"{first.name} has label set {first.label_set.name!r} and {part.name} has "
-                f"{part.label_set.name!r}; bring them onto one set before joining them."
-            )
-    return first if len(parts) == 1 else _Joined(tuple(parts))
+__all__ = [
+    "SPEC_HELP",
+    "ImagePairs",
+    "LabelledFiles",
+    "joined",
+    "open_camvid",
+    "open_cityscapes",
+    "open_drives",
+    "open_pairs",
+    "open_vistas",
+    "relabelled",
+]
