@@ -49,6 +49,8 @@ class ModelProfile(BaseModel):
             (lower case hex; for OpenVINO of the ``.bin``); empty: any.
         label_set: Name of a shipped label set, or path of a JSON file.
         input_size_px: (width, height) the network wants, or None for the image's own.
+        size_multiple_px: Images fed at their own size (and tiles) are continued to the right
+            and below to whole multiples of it, as networks that shrink and enlarge need.
         channels: Order of the colour channels.
         scale: Pixel values 0..255 are multiplied by this first.
         mean, std: Then normalized, per channel in that order.
@@ -63,6 +65,7 @@ class ModelProfile(BaseModel):
     sha256: tuple[Annotated[str, Field(pattern="^[0-9a-f]{64}$")], ...] = ()
     label_set: str
     input_size_px: tuple[_Pixels, _Pixels] | None = None
+    size_multiple_px: _Pixels = 1
     channels: Literal["rgb", "bgr"] = "rgb"
     scale: _Positive = 1 / 255
     mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
