@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
@@ -10,10 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hdmap_tools.errors import ShapeError
 from hdmap_tools.labels.label_set import IGNORE_ID
-from hdmap_tools.types import NDArrayByte
+from hdmap_tools.types import NDArrayByte, NDArrayFloat32
 
 if TYPE_CHECKING:
-    from torch import Generator, Tensor
+    from torch import Tensor
 
 _Positive = Annotated[float, Field(gt=0)]
 _Share = Annotated[float, Field(ge=0, le=1)]
@@ -21,6 +22,9 @@ _Amount = Annotated[float, Field(ge=0)]
 
 _LUMA: Final = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in brightness (ITU-R BT.601)."""
+_LEAST_BLUR_PX: Final = 0.2
+"""Of sigma; less leaves every byte as it is, nearly."""
+_NOISE_SIZE: Final = 1 << 22
 
 
 class Augmentation(BaseModel):
@@ -121,7 +125,7 @@ class Augment:
         import torch
         from torchvision import tv_tensors
         from torchvision.transforms import v2
-        from torchvision.transforms.v2 import functional as F
+        from torchvision.transforms.v2 import functional
 
         _check(rgb, ids)
         s = self.settings
@@ -133,43 +137,68 @@ class Augment:
         # A view with the channels last: torchvision resizes such bytes as they are.
         image: Any = torch.from_numpy(np.ascontiguousarray(rgb[rows, columns])).permute(2, 0, 1)
         mask: Any = torch.from_numpy(np.ascontiguousarray(ids[rows, columns]))[None]
-        image = F.resize_image(image, size, v2.InterpolationMode.BILINEAR, antialias=True)
+        image = functional.resize_image(image, size, v2.InterpolationMode.BILINEAR, antialias=True)
         # Torchvision resizes a Mask with NEAREST, which takes the first of the pixels it
         # could take: half a source pixel off from where the bilinear image has it.
-        mask = F.resize_image(mask, size, v2.InterpolationMode.NEAREST_EXACT)
+        mask = functional.resize_image(mask, size, v2.InterpolationMode.NEAREST_EXACT)
+        image = self._blurred(image, rng)
         pair = tv_tensors.Image(image), tv_tensors.Mask(mask)
         if rng.random() < s.flip:
-            pair = tuple(F.horizontal_flip(part) for part in pair)
+            pair = tuple(functional.horizontal_flip(part) for part in pair)
         bottom = s.crop_px - window.out_top - window.out_height
         right = s.crop_px - window.out_left - window.out_width
-        coloured = self._coloured(F.to_dtype(pair[0], torch.float32, scale=True), rng)
-        image = F.normalize(coloured.as_subclass(torch.Tensor), list(s.mean), list(s.std))
+        coloured = self._coloured(functional.to_dtype(pair[0], torch.float32, scale=True), rng)
+        image = functional.normalize(coloured.as_subclass(torch.Tensor), list(s.mean), list(s.std))
         ids_out = pair[1].as_subclass(torch.Tensor)
         if window.out_top or window.out_left or bottom or right:
             padding = [window.out_left, window.out_top, right, bottom]
-            image = F.pad(image, padding, fill=0.0)  # 0 is the mean colour by now
-            ids_out = F.pad(ids_out, padding, fill=IGNORE_ID)
+            image = functional.pad(image, padding, fill=0.0)  # 0 is the mean colour by now
+            ids_out = functional.pad(ids_out, padding, fill=IGNORE_ID)
         return image.contiguous(), ids_out[0].to(torch.int64)
 
-    def _coloured(self, image: Tensor, rng: np.random.Generator) -> Tensor:
-        """Another light, lens and sensor, (3, h, w) float32 in 0..1."""
+    def _blurred(self, image: Tensor, rng: np.random.Generator) -> Tensor:
+        """The lens, (3, h, w) uint8; before the light and the noise of the sensor."""
+        import cv2
         import torch
-        from torchvision.transforms.v2 import functional as F
+
+        s = self.settings
+        if not s.blur_px or rng.random() >= s.colour_probability:
+            return image
+        sigma = float(rng.uniform(0.0, s.blur_px))
+        if sigma < _LEAST_BLUR_PX:
+            return image
+        # OpenCV's is separable: a tenth of the time of torchvision's.
+        pixels = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
+        return torch.from_numpy(cv2.GaussianBlur(pixels, (0, 0), sigma)).permute(2, 0, 1)
+
+    def _coloured(self, image: Tensor, rng: np.random.Generator) -> Tensor:
+        """Another light and sensor, (3, h, w) float32 in 0..1."""
+        import torch
 
         s = self.settings
         changes = (s.brightness, s.contrast, s.saturation, s.white_balance)
         if any(changes) and rng.random() < s.colour_probability:
             image = _change_colours(image, rng, *changes)
-        if s.blur_px and rng.random() < s.colour_probability:
-            sigma = float(rng.uniform(0.0, s.blur_px))
-            if sigma > 0.2:  # less than that changes nothing
-                width = 2 * int(np.ceil(2 * sigma)) + 1
-                image = F.gaussian_blur(image, [width, width], [sigma, sigma])
         if s.noise and rng.random() < s.colour_probability:
-            sigma = float(rng.uniform(0.0, s.noise))
-            image = image + sigma * torch.randn(image.shape, generator=_generator(rng))
-            image = image.clamp_(0.0, 1.0)
+            sigma = np.float32(rng.uniform(0.0, s.noise))
+            noise = torch.from_numpy(sigma * _noise(image.numel(), rng))
+            image = (image + noise.reshape(image.shape)).clamp_(0.0, 1.0)
         return image
+
+
+def _noise(size: int, rng: np.random.Generator) -> NDArrayFloat32:
+    """Normal noise (size,), cut at random from a piece drawn once: a tenth of the time."""
+    if size > _NOISE_SIZE // 2:
+        return rng.standard_normal(size, dtype=np.float32)
+    first = int(rng.integers(_NOISE_SIZE - size))
+    return _much_noise()[first : first + size]
+
+
+@lru_cache
+def _much_noise() -> NDArrayFloat32:
+    noise = np.random.default_rng(0).standard_normal(_NOISE_SIZE, dtype=np.float32)
+    noise.setflags(write=False)
+    return noise
 
 
 def _draw_window(rng: np.random.Generator, height: int, width: int, s: Augmentation) -> _Window:
@@ -214,12 +243,6 @@ def _change_colours(
     offset = (1 - spread) * float(luma @ (gains * mean))
     flat = torch.from_numpy(matrix.astype(np.float32)) @ image.reshape(3, -1)
     return flat.add_(offset).clamp_(0.0, 1.0).reshape(image.shape)
-
-
-def _generator(rng: np.random.Generator) -> Generator:
-    import torch
-
-    return torch.Generator().manual_seed(int(rng.integers(2**63 - 1)))
 
 
 def _check(rgb: NDArrayByte, ids: NDArrayByte) -> None:
