@@ -18,7 +18,8 @@ stored, 9.1 mm (21,273) when compensated once more, 8.7 mm (15,928) when undone.
 **Images are published undistorted** although intrinsics.feather has k1, k2, k3:
 these describe the lens before undistortion. The data set's maintainers say so
 (argoverse/av2-api issues 219 and 226) and its own camera model projects with the
-matrix alone. `is_rectified=False` is for logs with raw images.
+matrix alone. `is_rectified=False` is for logs with raw images; where the table has a
+column ``is_rectified``, as `hdmap calibrate` writes it, 0 says the same of one camera.
 
 Source:
     https://argoverse.github.io/user-guide/datasets/sensor.html; `av2` package.
@@ -53,7 +54,7 @@ from hdmap_tools.readers.feather import read_columns
 from hdmap_tools.readers.folders import os_errors_are_drive_errors
 from hdmap_tools.readers.motion import compensate_ego_motion
 from hdmap_tools.readers.poses import trajectory_from_table
-from hdmap_tools.types import NDArrayAny
+from hdmap_tools.types import NDArrayAny, NDArrayBool
 
 logger = logging.getLogger(__name__)
 
@@ -82,6 +83,10 @@ _QUATERNION: Final = ("qw", "qx", "qy", "qz")
 _TRANSLATION: Final = ("tx_m", "ty_m", "tz_m")
 _INTRINSICS: Final = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
 _LENS: Final = ("k1", "k2", "k3")
+_TANGENTIAL: Final = ("p1", "p2")
+"""Not part of the layout: what `hdmap calibrate` finds of the lens besides."""
+_IS_RECTIFIED: Final = "is_rectified"
+"""Not part of the layout: 0 for a camera whose images are as the lens made them."""
 _CITY_IN_MAP_NAME: Final = re.compile(r"____([A-Z]+)_city_")
 _MAX_OFFSET_NS: Final = 1e10
 _IMAGE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png"})
@@ -246,10 +251,7 @@ def _read_cameras(
     mounts_path = calibration / "egovehicle_SE3_sensor.feather"
     if not intrinsics_path.exists():
         return {}, {}
-    lens = () if is_rectified else _LENS
-    intrinsics = read_columns(
-        intrinsics_path, ("sensor_name", *_INTRINSICS, *lens), (), CalibrationError
-    )
+    intrinsics, is_raw = _intrinsics_table(intrinsics_path, is_rectified)
     mounts = (
         read_columns(
             mounts_path, ("sensor_name", *_QUATERNION, *_TRANSLATION), (), CalibrationError
@@ -261,7 +263,6 @@ def _read_cameras(
     calibrated: dict[str, PinholeCamera] = {}
     unusable: dict[str, DriveError] = {}
     for name, row in _rows_by_sensor(intrinsics, intrinsics_path).items():
-        values = {key: float(intrinsics[key][row]) for key in (*_INTRINSICS, *lens)}
         try:
             if name not in row_of_mount:
                 raise CalibrationError(
@@ -270,10 +271,55 @@ def _read_cameras(
                     "expected its pose in the ego frame."
                 )
             mount = _mount(mounts, row_of_mount[name], name, mounts_path)
-            calibrated[name] = _camera(name, values, mount, intrinsics_path)
+            calibrated[name] = _camera(
+                name, _row(intrinsics, row, is_raw[row]), mount, intrinsics_path
+            )
         except CalibrationError as error:
             unusable[name] = error
     return calibrated, unusable
+
+
+def read_intrinsics(path: Path) -> dict[str, PinholeCamera]:
+    """Cameras of an intrinsics.feather, with the identity for a mount, which is in another table.
+
+    Raises:
+        CalibrationError: If the table or a row of it is unusable.
+    """
+    table, is_raw = _intrinsics_table(path, True)
+    return {
+        name: _camera(name, _row(table, row, is_raw[row]), SE3.identity(), path)
+        for name, row in _rows_by_sensor(table, path).items()
+    }
+
+
+def read_mounts(path: Path) -> dict[str, SE3]:
+    """``ego_SE3_sensor`` of all sensors in an egovehicle_SE3_sensor.feather.
+
+    Raises:
+        CalibrationError: If the table or a row of it is unusable.
+    """
+    table = read_columns(path, ("sensor_name", *_QUATERNION, *_TRANSLATION), (), CalibrationError)
+    return {
+        name: _mount(table, row, name, path) for name, row in _rows_by_sensor(table, path).items()
+    }
+
+
+def _intrinsics_table(path: Path, is_rectified: bool) -> tuple[dict[str, NDArrayAny], NDArrayBool]:
+    """Columns, and of which rows (N,) the images show the lens's distortion."""
+    required = ("sensor_name", *_INTRINSICS)
+    table = read_columns(path, required, (_IS_RECTIFIED,), CalibrationError)
+    said = table.pop(_IS_RECTIFIED, np.ones(len(table["sensor_name"])))
+    if not np.isin(said, (0, 1)).all():
+        raise CalibrationError(f"{path}: column {_IS_RECTIFIED} must hold 0 and 1 only.")
+    is_raw = (said == 0) | (not is_rectified)
+    if is_raw.any():
+        table = read_columns(path, (*required, *_LENS), _TANGENTIAL, CalibrationError)
+    return table, is_raw
+
+
+def _row(table: Mapping[str, NDArrayAny], row: int, is_raw: bool) -> dict[str, float]:
+    lens = [key for key in (*_LENS, *_TANGENTIAL) if is_raw and key in table]
+    return {key: float(table[key][row]) for key in (*_INTRINSICS, *lens)}
 
 
 def _rows_by_sensor(columns: Mapping[str, NDArrayAny], path: Path) -> dict[str, int]:
@@ -309,7 +355,7 @@ def _camera(name: str, values: Mapping[str, float], mount: SE3, path: Path) -> P
         raise CalibrationError(
             f"camera {name} in {path} has image size ({width}, {height}); expected whole pixels."
         )
-    k1, k2, k3 = (values.get(key, 0.0) for key in _LENS)
+    k1, k2, k3, p1, p2 = (values.get(key, 0.0) for key in (*_LENS, *_TANGENTIAL))
     return PinholeCamera(
         name=name,
         width_px=int(width),
@@ -319,7 +365,7 @@ def _camera(name: str, values: Mapping[str, float], mount: SE3, path: Path) -> P
         cx=values["cx_px"],
         cy=values["cy_px"],
         ego_SE3_cam=mount,
-        distortion=(k1, k2, 0.0, 0.0, k3),
+        distortion=(k1, k2, p1, p2, k3),
     )
 
 
