@@ -21,6 +21,7 @@
     ├── FormatError (ValueError)              a map file cannot be read or written
     ├── WorldError (ValueError)               a map that no vehicle can be simulated on
     ├── PointMapError (ValueError)            a point map cannot be made or used
+    ├── CheckpointError (ValueError)          a training run cannot be continued or exported
     ├── OutputExistsError (FileExistsError)   would overwrite
     └── MissingExtraError (ImportError)       an optional dependency is not installed
 
@@ -120,6 +121,10 @@ class WorldError(HDMapError, ValueError):
 
 class PointMapError(HDMapError, ValueError):
     """A point map cannot be made, read, or does not fit the drive."""
+
+
+class CheckpointError(HDMapError, ValueError):
+    """A training run's checkpoint is missing, damaged, or of another run."""
 
 
 class OutputExistsError(HDMapError, FileExistsError):
