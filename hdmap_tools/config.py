@@ -61,16 +61,30 @@ class DriveConfig(_Step):
     max_sweep_gap_s: Annotated[float, Field(gt=0)] = 0.1
 
 
+_SidePx = Annotated[int, Field(ge=1, le=16384)]
+SizePx = tuple[_SidePx, _SidePx]
+"""(width, height)."""
+
+
 class SegmentationConfig(_Step):
     """Where labels come from.
 
     Attributes:
-        model: Path of an ONNX or OpenVINO model; None looks in `models/` in and beside the drive.
+        model: Path of an ONNX or OpenVINO model, or the name of one that ships
+            (``street-small``); None looks in `models/` in and beside the drive, and takes
+            the shipped one where none lies there.
             ``simulated`` puts errors on the true labels of a drive made by `hdmap simulate`.
-        profile: Name or path of a model profile; None finds it by the model's hash.
+        profile: Name or path of a model profile; None takes it from the model's own metadata,
+            or finds it by the model's hash.
         labels: Folder of label PNGs ``<camera>/<timestamp_ns>.png``, instead of a model.
-        label_set: Label set of those PNGs.
+        label_set: Label set of those PNGs, or of a model of which nothing is known.
         threads: CPU threads of the network; 0 is its own choice.
+        input_size_px: (width, height) to feed such a model; None is what it takes.
+        batch: Images or tiles given to the network at once, where it takes several.
+        tile_px: (width, height) of tiles that large images are cut into; None feeds them whole.
+        tile_overlap_px: By how much tiles overlap.
+        undistort: Show the network the rectified image of a camera with distortion; its
+            labels are brought back to the recorded one.
         confusion: Confusion matrix that ``simulated`` errs by; None is one assumed.
         seed: Of the errors of ``simulated``.
     """
@@ -80,6 +94,11 @@ class SegmentationConfig(_Step):
     labels: Path | None = None
     label_set: str | None = None
     threads: Annotated[int, Field(ge=0)] = 0
+    input_size_px: SizePx | None = None
+    batch: Annotated[int, Field(ge=1, le=256)] = 1
+    tile_px: SizePx | None = None
+    tile_overlap_px: Annotated[int, Field(ge=0)] = 128
+    undistort: bool = True
     confusion: Path | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 from hdmap_tools.config import Config
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.learn_intensity import learn_from_map
@@ -30,6 +32,10 @@ def model_for(meta: MapMeta, config: Config, source: HasCounts | None = None) ->
     confusion = None
     if config.observation.confusion is not None:
         confusion = ConfusionMatrix.load(config.observation.confusion)
+    elif config.observation.model != "vanilla" and meta.confusion is not None:
+        confusion = ConfusionMatrix.from_json(
+            json.dumps(meta.confusion), "The confusion matrix that the map carries"
+        )
     elif config.observation.model != "vanilla":
         confusion = find_confusion(meta.label_set, meta.model)
     model = observation_model(config.observation, meta, config.classes, confusion)

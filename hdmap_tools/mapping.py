@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -32,6 +33,7 @@ from hdmap_tools.opening import require_images
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
+from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
@@ -236,19 +238,19 @@ class FrameSource:
         return associate_surface(labels, label_set, camera, pose, grounded, resolution_m, config)
 
 
-def map_meta(
-    config: Config, drive: Drive, label_set: LabelSet, model: str, threshold: int
-) -> MapMeta:
-    """What a map built from this drive with this configuration means."""
+def map_meta(config: Config, drive: Drive, segmenter: Segmenter, threshold: int) -> MapMeta:
+    """What a map built from this drive with this configuration and network means."""
+    confusion = confusion_of(segmenter)
     return MapMeta(
         resolution_m=config.fusion.resolution_m,
-        label_set=label_set,
+        label_set=segmenter.label_set,
         count_mode=config.fusion.count_mode,
         intensity_threshold=threshold,
         range_edges_m=config.fusion.range_edges_m,
         reference_height_m=config.fusion.reference_height_m,
         frame_document=drive.frame.to_json(),
-        model=model,
+        model=segmenter.name,
+        confusion=None if confusion is None else json.loads(confusion.to_json()),
     )
 
 
@@ -389,7 +391,7 @@ def build_map(
 
     with steps.timed("segment and fuse"):
         threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
-        meta = map_meta(config, drive, segmenter.label_set, segmenter.name, threshold)
+        meta = map_meta(config, drive, segmenter, threshold)
         maps = {
             method: SemanticMap.create(
                 path if number == 0 or also_in is None else also_in / method, meta

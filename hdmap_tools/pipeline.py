@@ -25,7 +25,7 @@ from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.readers.image import read_image
 from hdmap_tools.run_metrics import RunMetrics, versions
 from hdmap_tools.segmentation.cache import LabelCache
-from hdmap_tools.segmentation.open_segmenter import SIMULATED, find_model, open_segmenter
+from hdmap_tools.segmentation.open_segmenter import NAMED_MODELS, find_model, open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
@@ -158,7 +158,7 @@ def settled(config: Config, drive: Drive) -> Config:
     if model is None and segmentation.labels is None:
         model = find_model(drive.root)
         _LOG.info("Using the model %s.", model)
-    if str(model) != SIMULATED:
+    if str(model) not in NAMED_MODELS:
         model = _absolute(model)
     reference = compare.reference
     if reference is None:
@@ -187,7 +187,7 @@ def check_settings(config: Config, drive: Drive, segmenter: Segmenter) -> None:
     Raises:
         HDMapError: As those steps would.
     """
-    model_for(map_meta(config, drive, segmenter.label_set, segmenter.name, 1), config)
+    model_for(map_meta(config, drive, segmenter, 1), config)
     choose(config.vectorize)
     reference = config.compare.reference
     if reference is not None and not reference.exists():

@@ -62,9 +62,7 @@ def build_alone(
                 model = SemanticMap.open(like).meta
                 config = settings_of(config, model)
                 threshold = model.intensity_threshold
-                map_meta(
-                    config, drive, segmenter.label_set, segmenter.name, threshold
-                ).require_compatible(model)
+                map_meta(config, drive, segmenter, threshold).require_compatible(model)
         with steps.timed("points"):
             config, drive = with_points(config, drive, folder.parent / "scratch")
         maps, counts = build_map(drive, segmenter, folder, config, cache, steps)

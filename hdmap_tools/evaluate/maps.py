@@ -106,7 +106,7 @@ def fuse_variants(
         return segment_drive(drive, segmenter, some, cache)
 
     threshold = intensity_threshold(config, first, images, labels_of, segmenter.label_set)
-    base = map_meta(config, drive, segmenter.label_set, segmenter.name, threshold)
+    base = map_meta(config, drive, segmenter, threshold)
     metas = {
         v.name: base.model_copy(
             update={"count_mode": v.count_mode, "range_edges_m": v.range_edges_m}

@@ -30,6 +30,8 @@ class MapMeta(BaseModel):
         reference_height_m: City height from which stored heights count.
         frame_document: The city frame (`MapFrame.to_json`).
         model: Name of the segmentation model; finds its confusion matrix on reading.
+        confusion: The matrix that came with the model (a document as `ConfusionMatrix` writes
+            it), which then is read with instead.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -43,6 +45,7 @@ class MapMeta(BaseModel):
     reference_height_m: WholeMillimetres = 0.0
     frame_document: dict[str, Any] = Field(default_factory=lambda: MapFrame().to_json())
     model: str = ""
+    confusion: dict[str, Any] | None = None
 
     @property
     def frame(self) -> MapFrame:
@@ -71,6 +74,8 @@ class MapMeta(BaseModel):
         differing = [
             f"{key} {mine[key]!r} and {theirs[key]!r}" for key in mine if mine[key] != theirs[key]
         ]
+        if not differing and self.confusion != other.confusion:
+            differing = [f"the confusion matrix that came with model {self.model!r}"]
         if not differing and self.label_set != other.label_set:
             differing = [f"label set {self.label_set.name!r} with different labels"]
         if differing:

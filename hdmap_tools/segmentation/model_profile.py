@@ -75,26 +75,14 @@ def find_profile(model: Path) -> ModelProfile | None:
     return None
 
 
-def profile_for(model: Path, name_or_path: str | None) -> ModelProfile:
-    """The profile asked for, or the one known by the model's hash.
+def profile_for(model: Path, name_or_path: str) -> ModelProfile:
+    """The profile asked for, for a model file.
 
     Raises:
-        ConfigError: If none is asked for and none is known, or the one asked
-            for cannot be read.
+        ConfigError: If it cannot be read, or there is no such model.
     """
+    require_model_file(model)
     weights = weights_file(model)
-    if not weights.is_file():
-        raise ConfigError(f"There is no model file {weights}.")
-    if name_or_path is None:
-        profile = find_profile(model)
-        if profile is None:
-            raise ConfigError(
-                f"No profile is known for model {model} (sha256 {sha256_of_files([weights])} of "
-                f"{weights.name}), so how to feed it is not known either. Give one with --profile: "
-                f"a shipped name ({', '.join(sorted(builtin_profiles()))}) or a JSON file with "
-                f"the fields {', '.join(ModelProfile.model_fields)}."
-            )
-        return profile
     profile = load_profile(name_or_path)
     if profile.sha256 and sha256_of_files([weights]) not in profile.sha256:
         _log.warning(
@@ -103,6 +91,13 @@ def profile_for(model: Path, name_or_path: str | None) -> ModelProfile:
             weights,
         )
     return profile
+
+
+def require_model_file(model: Path) -> None:
+    """Raise `ConfigError` unless there is the file that holds a model's weights."""
+    weights = weights_file(model)
+    if not weights.is_file():
+        raise ConfigError(f"There is no model file {weights}.")
 
 
 def weights_file(model: Path) -> Path:

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hdmap_tools.errors import ConfigError
 from hdmap_tools.geometry.camera import PinholeCamera
+from hdmap_tools.segmentation.feeding import Feeding, Output
 from hdmap_tools.segmentation.model_profile import sha256_of_files
-from hdmap_tools.segmentation.network import Network, NetworkSegmenter
+from hdmap_tools.segmentation.network import Handling, Network, NetworkSegmenter
 from hdmap_tools.segmentation.segmenter import ModelProfile
 from hdmap_tools.types import NDArrayAny, NDArrayFloat32
 
 
 def load_onnx(
     model: Path,
-    profile: ModelProfile,
+    feeding: ModelProfile | Feeding,
     cameras: Mapping[str, PinholeCamera],
     *,
     threads: int = 0,
+    handling: Handling | None = None,
 ) -> NetworkSegmenter:
     """A segmenter from an ONNX file.
 
     Args:
         model: The ``.onnx`` file; weights kept outside it lie in files beside it.
-        profile: How to feed the network and read its answer.
+        feeding: How to feed the network and read its answer, or all that is known of it.
         cameras: Cameras by name.
         threads: CPU threads for one image; 0 is one a core.
+        handling: How images are brought to it.
 
     Raises:
         ConfigError: If the file is missing or no model, or its inputs and
@@ -52,6 +55,10 @@ def load_onnx(
     if len(inputs) != 1 or inputs[0].type != "tensor(float)":
         found = ", ".join(f"{i.name} {i.type}" for i in inputs)
         raise ConfigError(f"Model {model} has inputs {found}; expected one of tensor(float).")
+    known = feeding if isinstance(feeding, Feeding) else Feeding(feeding)
+    input_shape = _lengths(inputs[0].shape)
+    found_outputs = [Output(o.name, _lengths(o.shape), "int" in o.type) for o in outputs]
+    profile = known.settled(model, input_shape, found_outputs)
     output_name = choose_output(model, [o.name for o in outputs], profile)
 
     def run(batch: NDArrayFloat32) -> NDArrayAny:
@@ -67,10 +74,18 @@ def load_onnx(
         path=model,
         runtime=f"onnxruntime {onnxruntime.__version__}",
         weights_sha256=sha256_of_files(_with_external_weights(model)),
-        input_shape=tuple(n if isinstance(n, int) else None for n in inputs[0].shape),
+        input_shape=input_shape,
         run=run,
+        output_shape=next(o.shape for o in found_outputs if o.name == output_name),
     )
-    return NetworkSegmenter(network, profile, cameras)
+    return NetworkSegmenter(
+        network,
+        profile,
+        cameras,
+        label_set=known.label_set,
+        confusion=known.confusion,
+        handling=handling,
+    )
 
 
 def choose_output(model: Path, names: list[str], profile: ModelProfile) -> str:
@@ -93,6 +108,11 @@ def choose_output(model: Path, names: list[str], profile: ModelProfile) -> str:
             "holds the labels, as output_name."
         )
     return names[0]
+
+
+def _lengths(shape: Sequence[int | str | None]) -> tuple[int | None, ...]:
+    """A shape with None for what has a name or no length."""
+    return tuple(n if isinstance(n, int) and n > 0 else None for n in shape)
 
 
 def _with_external_weights(model: Path) -> list[Path]:

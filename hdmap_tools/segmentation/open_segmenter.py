@@ -12,24 +12,33 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.labels.label_set import LabelSet, load_label_set
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
+from hdmap_tools.segmentation.embedded import read_embedded
+from hdmap_tools.segmentation.feeding import HOW_TO_SAY, Feeding
 from hdmap_tools.segmentation.model_profile import (
+    builtin_profiles,
     find_profile,
     profile_for,
+    require_model_file,
     sha256_of_files,
     weights_file,
 )
-from hdmap_tools.segmentation.network import NetworkSegmenter
+from hdmap_tools.segmentation.network import Handling, NetworkSegmenter
 from hdmap_tools.segmentation.precomputed import (
     LABEL_SET_NAME,
     PrecomputedSegmenter,
     require_label_folder,
 )
-from hdmap_tools.segmentation.segmenter import Segmenter
+from hdmap_tools.segmentation.segmenter import ModelProfile, Segmenter
+from hdmap_tools.segmentation.shipped import SHIPPED, STREET_SMALL, is_shipped, shipped_network
+from hdmap_tools.segmentation.tiling import Tiling
 
 _log = logging.getLogger(__name__)
 
 SIMULATED = "simulated"
 """As a model: the true label images of a simulated drive, with errors."""
+
+NAMED_MODELS = (SIMULATED, *SHIPPED)
+"""Models that are known by name and are no paths."""
 
 _HOW_TO_GIVE = (
     "give a model with --model PATH (.onnx or .xml), or label images with --labels FOLDER "
@@ -42,12 +51,13 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
 
     Label PNGs if a folder of them is given (their label set may lie in it), else the
     model given, where ``simulated`` puts errors on the true labels of a simulated drive,
-    else the one model with a known profile in ``models/`` in the drive's folder, beside
-    it, or in the working directory.
+    else the one model that says of itself how to feed it, or whose profile is known, in
+    ``models/`` in the drive's folder, beside it, or in the working directory; else the
+    network that ships with the package.
 
     Raises:
         ConfigError: If what is given does not exist or fit, or nothing is given
-            and not exactly one known model is found.
+            and several known models are found.
         LabelError: If the label set cannot be read.
         MissingExtraError: If the model needs a runtime that is not installed.
     """
@@ -70,14 +80,18 @@ def open_segmenter(config: SegmentationConfig, drive: Drive) -> Segmenter:
     if model is None:
         model = find_model(drive.root)
         _log.info("Using the model %s.", model)
-    segmenter = open_model(model, config.profile, drive.cameras, threads=config.threads)
-    if config.label_set not in (None, segmenter.label_set.name):
-        raise ConfigError(
-            f"Label set {config.label_set!r} is asked for, but model {model} gives "
-            f"{segmenter.label_set.name!r} by its profile {segmenter.name!r}; leave --label-set "
-            "out, or name it in a profile of your own."
-        )
-    return segmenter
+    tiling = None
+    if config.tile_px is not None:
+        tiling = Tiling(config.tile_px, config.tile_overlap_px)
+    return open_model(
+        model,
+        config.profile,
+        drive.cameras,
+        threads=config.threads,
+        label_set=config.label_set,
+        input_size_px=config.input_size_px,
+        handling=Handling(config.batch, tiling, config.undistort),
+    )
 
 
 def _simulated(config: SegmentationConfig, drive: Drive) -> Segmenter:
@@ -117,19 +131,29 @@ def open_model(
     cameras: Mapping[str, PinholeCamera],
     *,
     threads: int = 0,
+    label_set: str | None = None,
+    input_size_px: tuple[int, int] | None = None,
+    handling: Handling | None = None,
 ) -> NetworkSegmenter:
-    """A network by the suffix of its file: ``.onnx`` or ``.xml``.
+    """A network by name if it ships, or by the suffix of its file: ``.onnx`` or ``.xml``.
 
     Args:
         model: The model file.
-        profile: Name or path of its profile; None finds it by the model's hash.
+        profile: Name or path of its profile; None takes what the file says of itself, or
+            the profile known by the model's hash.
         cameras: Cameras by name.
         threads: CPU threads for one image; 0 is the runtime's choice.
+        label_set: Name or path of the label set of a model of which nothing is known.
+        input_size_px: (width, height) to feed such a model; None is what it takes.
+        handling: How images are brought to it.
 
     Raises:
         ConfigError: If the model or profile cannot be used.
+        LabelError: If the model's outputs do not match its label set.
         MissingExtraError: If the model needs a runtime that is not installed.
     """
+    if str(model) in SHIPPED:
+        model = shipped_network(str(model))
     suffix = model.suffix.lower()
     if suffix == ".onnx":
         from hdmap_tools.segmentation.onnx import load_onnx as load
@@ -138,28 +162,91 @@ def open_model(
     else:
         raise ConfigError(
             f"Model {model} has suffix {suffix!r}; expected .onnx or .xml (OpenVINO, with its .bin "
-            "beside it)."
+            f"beside it), or the name of a shipped network ({', '.join(SHIPPED)})."
         )
-    return load(model, profile_for(model, profile), cameras, threads=threads)
+    feeding = _feeding(model, profile, label_set, input_size_px)
+    return load(model, feeding, cameras, threads=threads, handling=handling)
+
+
+def _feeding(
+    model: Path,
+    profile: str | None,
+    label_set: str | None,
+    input_size_px: tuple[int, int] | None,
+) -> Feeding:
+    """All that is known of a model: told, said by its file, or known by its hash, in this order."""
+    require_model_file(model)
+    if profile is None:
+        known = known_feeding(model)
+        if known is None and label_set is not None:
+            return Feeding(label_set=load_label_set(label_set), input_size_px=input_size_px)
+        if known is None:
+            raise ConfigError(
+                f"{_nothing_known(model)}: {HOW_TO_SAY}. A profile is the name of a shipped one "
+                f"({', '.join(sorted(builtin_profiles()))}) or a JSON file with the fields "
+                f"{', '.join(ModelProfile.model_fields)}."
+            )
+    else:
+        known = Feeding(profile_for(model, profile))
+    assert known.profile is not None
+    if input_size_px not in (None, known.profile.input_size_px):
+        raise ConfigError(
+            f"An input size of {input_size_px} is asked for, but profile {known.profile.name!r} of "
+            f"model {model} feeds {known.profile.input_size_px or 'images at their own size'}; "
+            "leave --input-size out, or change it in a profile of your own."
+        )
+    has = known.label_set or load_label_set(known.profile.label_set)
+    if label_set not in (None, has.name) and load_label_set(str(label_set)) != has:
+        raise ConfigError(
+            f"Label set {label_set!r} is asked for, but model {model} gives "
+            f"{has.name!r} by its profile {known.profile.name!r}; leave --label-set "
+            "out, or name it in a profile of your own."
+        )
+    return known
+
+
+def known_feeding(model: Path) -> Feeding | None:
+    """What a model's file says of itself, or what is known of it by its hash; else None.
+
+    Raises:
+        ConfigError: If it is no model, or what it says cannot be read.
+    """
+    if model.suffix.lower() == ".onnx":
+        embedded = read_embedded(model)
+        if embedded is not None:
+            return Feeding(embedded.profile, embedded.label_set, embedded.confusion)
+    profile = find_profile(model)
+    return None if profile is None else Feeding(profile)
+
+
+def _nothing_known(model: Path) -> str:
+    weights = weights_file(model)
+    said = (
+        f"No profile is known for model {model} (sha256 {sha256_of_files([weights])} of "
+        f"{weights.name})"
+    )
+    if model.suffix.lower() == ".onnx":
+        said += ", and it carries none in its metadata"
+    return f"{said}, so how to feed it is not known either"
 
 
 def find_model(drive_root: Path) -> Path:
-    """The one model with a known profile that lies with a drive.
+    """The one known model that lies with a drive, or the name of the one that ships.
 
     Raises:
-        ConfigError: If there is none, or several; the message lists where it
-            looked or what it found.
+        ConfigError: If there are several with the drive, or none at all; the message lists
+            what it found, or where it looked.
     """
     root = drive_root.resolve()
     places = list(dict.fromkeys([root / "models", root.parent / "models", Path.cwd() / "models"]))
     found: dict[str, Path] = {}
     unknown: list[Path] = []
     for model in _models_in(places):
-        if find_profile(model) is None:
-            unknown.append(model)
-        else:
+        if _is_known(model):
             # The same weights twice are one choice, not two.
             found.setdefault(sha256_of_files([weights_file(model)]), model)
+        else:
+            unknown.append(model)
     if len(found) == 1:
         return next(iter(found.values()))
     if found:
@@ -169,14 +256,26 @@ def find_model(drive_root: Path) -> Path:
         )
     others = (
         f" The models {', '.join(map(str, unknown))} have no known profile; using one takes "
-        "--model and --profile."
+        "--model and --label-set, or --profile."
         if unknown
         else ""
     )
+    if is_shipped(STREET_SMALL):
+        if others:
+            _log.warning("%s is used.%s", STREET_SMALL, others)
+        return Path(STREET_SMALL)
     raise ConfigError(
         f"No segmentation model is given, and none with a known profile lies in "
         f"{', '.join(map(str, places))}: {_HOW_TO_GIVE}.{others}"
     )
+
+
+def _is_known(model: Path) -> bool:
+    try:
+        return known_feeding(model) is not None
+    except ConfigError as error:
+        _log.warning("Not used: %s", error)
+        return False
 
 
 def _models_in(folders: list[Path]) -> Iterator[Path]:

@@ -9,8 +9,9 @@ from typing import Any
 
 from hdmap_tools.errors import ConfigError, MissingExtraError
 from hdmap_tools.geometry.camera import PinholeCamera
+from hdmap_tools.segmentation.feeding import Feeding, Output
 from hdmap_tools.segmentation.model_profile import sha256_of_files
-from hdmap_tools.segmentation.network import Network, NetworkSegmenter
+from hdmap_tools.segmentation.network import Handling, Network, NetworkSegmenter
 from hdmap_tools.segmentation.onnx import choose_output
 from hdmap_tools.segmentation.segmenter import ModelProfile
 from hdmap_tools.types import NDArrayAny, NDArrayFloat32
@@ -18,10 +19,11 @@ from hdmap_tools.types import NDArrayAny, NDArrayFloat32
 
 def load_openvino(
     model: Path,
-    profile: ModelProfile,
+    feeding: ModelProfile | Feeding,
     cameras: Mapping[str, PinholeCamera],
     *,
     threads: int = 0,
+    handling: Handling | None = None,
 ) -> NetworkSegmenter:
     """A segmenter from an OpenVINO IR file.
 
@@ -31,9 +33,10 @@ def load_openvino(
 
     Args:
         model: The ``.xml`` file, with the ``.bin`` of the same name beside it.
-        profile: How to feed the network and read its answer.
+        feeding: How to feed the network and read its answer, or all that is known of it.
         cameras: Cameras by name.
         threads: CPU threads for one image; 0 is one a core.
+        handling: How images are brought to it.
 
     Raises:
         MissingExtraError: If OpenVINO is not installed.
@@ -75,6 +78,13 @@ def load_openvino(
         sorted(port.get_names() or {f"output {index}"})
         for index, port in enumerate(compiled.outputs)
     ]
+    known = feeding if isinstance(feeding, Feeding) else Feeding(feeding)
+    input_shape = _lengths(compiled.input(0))
+    found_outputs = [
+        Output(str(aliases[0]), _lengths(port), port.element_type.is_integral())
+        for aliases, port in zip(names, compiled.outputs, strict=True)
+    ]
+    profile = known.settled(model, input_shape, found_outputs)
     wanted = profile.output_name
     shown = [wanted if wanted in aliases else aliases[0] for aliases in names]
     output_index = shown.index(choose_output(model, [str(name) for name in shown], profile))
@@ -99,12 +109,26 @@ def load_openvino(
         path=model,
         runtime=f"openvino {openvino.__version__}",
         weights_sha256=sha256_of_files([model, weights]),
-        input_shape=tuple(
-            None if n.is_dynamic else n.get_length() for n in compiled.input(0).partial_shape
-        ),
+        input_shape=input_shape,
         run=run,
+        output_shape=found_outputs[output_index].shape,
     )
-    return NetworkSegmenter(network, profile, cameras)
+    return NetworkSegmenter(
+        network,
+        profile,
+        cameras,
+        label_set=known.label_set,
+        confusion=known.confusion,
+        handling=handling,
+    )
+
+
+def _lengths(port: Any) -> tuple[int | None, ...]:
+    """The shape of an input or output, None where it is not fixed; empty where nothing is."""
+    shape = port.partial_shape
+    if shape.rank.is_dynamic:
+        return ()
+    return tuple(None if n.is_dynamic else n.get_length() for n in shape)
 
 
 def _first_words(error: Exception) -> str:

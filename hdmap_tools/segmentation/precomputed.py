@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from hdmap_tools.errors import ConfigError
+from hdmap_tools.errors import ConfigError, LabelError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.readers.drive import ImageRef
+from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.segmentation.label_png import read_label_png
 from hdmap_tools.segmentation.network import camera_of
 from hdmap_tools.types import NDArrayByte
@@ -20,6 +21,8 @@ LABEL_SET_NAME: Final = "label_set.json"
 """In a folder of label images: what their ids mean."""
 MODEL_NAME: Final = "model.json"
 """In a folder of label images: ``{"model": NAME}``, what made them."""
+CONFUSION_NAME: Final = "confusion.json"
+"""In a folder of label images: the confusion matrix that came with what made them."""
 
 
 def label_path(folder: Path, image: ImageRef) -> Path:
@@ -41,13 +44,14 @@ class PrecomputedSegmenter:
 
     Args:
         folder: Holds ``<camera>/<timestamp_ns>.png``, 8-bit single channel, and may
-            hold `MODEL_NAME`.
+            hold `MODEL_NAME` and `CONFUSION_NAME`.
         label_set: What the ids in them mean.
         cameras: Cameras by name, for the size of their images.
 
     Raises:
         ConfigError: If the folder does not exist, or says what made it in a way that
             cannot be read.
+        LabelError: If the confusion matrix in it is of other labels.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class PrecomputedSegmenter:
         self._label_set = label_set
         self._cameras = cameras
         self._name = _model_of(folder)
+        self.confusion = _confusion_of(folder, label_set)
 
     @property
     def name(self) -> str:
@@ -109,3 +114,16 @@ def _model_of(folder: Path) -> str:
             f'{path} does not say what made the labels; expected {{"model": "NAME"}}.'
         )
     return name
+
+
+def _confusion_of(folder: Path, label_set: LabelSet) -> ConfusionMatrix | None:
+    path = folder / CONFUSION_NAME
+    if not path.is_file():
+        return None
+    matrix = ConfusionMatrix.load(path)
+    if matrix.predicted_set.names != label_set.names:
+        raise LabelError(
+            f"{path} is of the labels of {matrix.predicted_set.name!r}, but the label images beside it "
+            f"are of {label_set.name!r}; remove it, or name the label set that it is of."
+        )
+    return matrix

@@ -65,8 +65,8 @@ def test_several_outputs_need_a_name(make_onnx, make_profile, paint, tmp_path):
 def test_wrong_channels_and_nan(make_onnx, make_profile, paint, tmp_path):
     rgb, _ = paint(BLOCKS, 2)
     model = make_onnx(tmp_path / "five.onnx", channels=5)
-    with pytest.raises(LabelError, match=r"gave 5 channels, but label set 'colours' has 4"):
-        load_onnx(model, make_profile(), {}).segment_rgb(rgb)
+    with pytest.raises(LabelError, match=r"five\.onnx gives 5 channels .*'colours' has 4 labels"):
+        load_onnx(model, make_profile(), {})
     model = make_onnx(tmp_path / "nan.onnx", kind="nan")
     with pytest.raises(LabelError, match=r"nan\.onnx.*NaN or infinite"):
         load_onnx(model, make_profile(), {}).segment_rgb(rgb, "picture 7")
@@ -90,7 +90,9 @@ def test_a_missing_file_is_named(make_profile, tmp_path):
 def test_other_weights_are_another_fingerprint(make_onnx, make_profile, tmp_path):
     one = load_onnx(make_onnx(tmp_path / "a.onnx"), make_profile(), {})
     same = load_onnx(make_onnx(tmp_path / "b.onnx"), make_profile(), {})
-    other = load_onnx(make_onnx(tmp_path / "c.onnx", channels=5), make_profile(), {})
+    other = load_onnx(
+        make_onnx(tmp_path / "c.onnx", kind="two"), make_profile(output_name="scores"), {}
+    )
     assert one.fingerprint == same.fingerprint != other.fingerprint
     # Weights may lie outside the file, beside it.
     (tmp_path / "a.onnx.data").write_bytes(b"more")
