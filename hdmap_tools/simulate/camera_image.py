@@ -173,16 +173,15 @@ def _sunlight(
 ) -> NDArrayFloat32:
     """(N,) how much of the sun each hit gets; all of it where shadows are not worth a ray."""
     from hdmap_tools.simulate.compiled import in_bands
-    from hdmap_tools.simulate.shading import spread_sunlight, sun_rays
+    from hdmap_tools.simulate.shadow_kernels import spread_sunlight, sun_rays
 
     sunlight = np.ones(len(rays), np.float32)
     if max(light.sun) < 0.2:
         return sunlight
     shape = (camera.height_px, camera.width_px)
-    asked = np.zeros(shape, np.bool_)
-    asked[::2, ::2] = True
-    asked = asked.ravel() & (hits.normal @ np.array(light.sun_direction, np.float32) > 0)
-    rows = np.flatnonzero(asked & (hits.material != Mat.SKY))
+    asked = np.arange(len(rays)).reshape(shape)[::2, ::2].ravel()
+    to_sun = hits.normal[asked] @ np.array(light.sun_direction, np.float32) > 0
+    rows = asked[to_sun & (hits.material[asked] != Mat.SKY)]
     towards_sun = np.empty((len(rows), 6), np.float32)
     in_bands(
         lambda first, last: sun_rays(
@@ -219,7 +218,7 @@ def _open_sky(
     import cv2
 
     from hdmap_tools.simulate.compiled import in_bands
-    from hdmap_tools.simulate.shading import sky_rays
+    from hdmap_tools.simulate.shadow_kernels import sky_rays
 
     if max(light.sun) >= 0.2:
         return np.ones(len(rays), np.float32)

@@ -63,7 +63,7 @@ def form_image(light: NDArrayFloat32, look: CameraLook, rng: np.random.Generator
     import cv2
 
     from hdmap_tools.simulate.compiled import in_bands
-    from hdmap_tools.simulate.shading import finish
+    from hdmap_tools.simulate.image_kernels import finish
 
     optics = _OPTICS[look.difficulty]
     height, width = light.shape[:2]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from math import cos, exp, pi, sin, sqrt
+from math import cos, exp, log, pi, sin, sqrt
 
 import numpy as np
 
 from hdmap_tools.simulate.compiled import compiled
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
 _SKY = 255
 
@@ -32,13 +32,13 @@ def turn_rays(
         rays: (A * R, 6) written.
     """
     num_azimuths, num_rings = len(origins), len(elevations_rad)
+    level, up = np.cos(elevations_rad), np.sin(elevations_rad)
     for a in range(first, last):
         azimuth = pi - 2.0 * pi * a / num_azimuths
+        ahead, left = cos(azimuth), sin(azimuth)
         turn = rotations[a]
         for r in range(num_rings):
-            x = cos(elevations_rad[r]) * cos(azimuth)
-            y = cos(elevations_rad[r]) * sin(azimuth)
-            z = sin(elevations_rad[r])
+            x, y, z = level[r] * ahead, level[r] * left, up[r]
             i = a * num_rings + r
             for k in range(3):
                 rays[i, k] = origins[a, k]
@@ -109,9 +109,12 @@ def receive(
         retro *= 1.0 - 0.6 * wet
         air = exp(-2.0 * haze_per_m * r)
         # Of the light that comes back, against the least that is noticed.
-        signal = rho / 0.8 * facing ** ((0.4 + 0.4 * wet) * (1.0 - 0.6 * retro))
+        slant = log(facing)
+        signal = rho / 0.8 * exp(slant * (0.4 + 0.4 * wet) * (1.0 - 0.6 * retro))
         signal *= 2.0 * (limits[1] / r) ** 2 * air
-        kept = signal**4 / (1.0 + signal**4) * (1.0 - loss)
+        signal *= signal
+        signal *= signal
+        kept = signal / (1.0 + signal) * (1.0 - loss)
         if is_glass[mat]:
             kept *= 0.4
         if random[2, i] > kept or r > 1.5 * limits[1]:
@@ -119,7 +122,47 @@ def receive(
         range_m[i] = r + range_sigma_m * random[0, i]
         # Near the lens the spot is out of focus; far away the receiver's gain gives out.
         response = 1.12 * (1.0 - exp(-r / 4.0)) / (1.0 + (r / 70.0) ** 2)
-        shown = 234.0 * rho * facing ** (0.3 * (1.0 - 0.5 * retro)) * response * sqrt(air)
+        shown = 234.0 * rho * exp(slant * 0.3 * (1.0 - 0.5 * retro)) * response * sqrt(air)
         shown *= ring_gains[i % num_rings]
         shown *= 1.0 + 0.08 * random[1, i]
         intensity[i] = int(min(max(shown + 0.5, 0.0), 255.0))
+
+
+@compiled
+def collect(
+    kept: NDArrayInt,
+    num_rings: int,
+    rays: NDArrayFloat32,
+    range_m: NDArrayFloat32,
+    rotation: NDArrayFloat,
+    place: NDArrayFloat,
+    intensity: NDArrayByte,
+    material: NDArrayByte,
+    azimuth_ns: NDArrayInt,
+    points: NDArrayFloat32,
+    received: NDArrayByte,
+    materials: NDArrayByte,
+    rings: NDArrayByte,
+    offset_ns: NDArrayAny,
+) -> None:
+    """What the kept rays tell, one after the other.
+
+    Takes:
+        kept: (K,) rays with a return.
+        num_rings: Lasers; ray i is of laser ``i % num_rings``.
+        rays, range_m, intensity, material: By ray.
+        rotation, place: (3, 3) and (3,) of the ego frame, from the scene's origin.
+        azimuth_ns: (A,) time of each azimuth.
+        points: (K, 3) written, ego frame.
+        received, materials, rings, offset_ns: (K,) written.
+    """
+    for j in range(len(kept)):
+        i = kept[j]
+        x = rays[i, 0] + range_m[i] * rays[i, 3] - place[0]
+        y = rays[i, 1] + range_m[i] * rays[i, 4] - place[1]
+        z = rays[i, 2] + range_m[i] * rays[i, 5] - place[2]
+        for k in range(3):
+            points[j, k] = x * rotation[0, k] + y * rotation[1, k] + z * rotation[2, k]
+        azimuth = i // num_rings
+        received[j], materials[j] = intensity[i], material[i]
+        rings[j], offset_ns[j] = i - azimuth * num_rings, azimuth_ns[azimuth]

@@ -72,7 +72,7 @@ def scan_sweep(
         PoseError: If the trajectory does not cover the turn.
     """
     from hdmap_tools.simulate.compiled import in_bands
-    from hdmap_tools.simulate.lidar_kernels import receive, turn_rays
+    from hdmap_tools.simulate.lidar_kernels import collect, receive, turn_rays
 
     num_rings, num_azimuths = lidar.num_rings, lidar.num_azimuths
     count = num_rings * num_azimuths
@@ -136,20 +136,31 @@ def scan_sweep(
 
     in_bands(receive_band, count)
     kept = np.flatnonzero(np.isfinite(range_m))
-    kept_rays = rays[kept]
-    points = kept_rays[:, :3] + range_m[kept, None] * kept_rays[:, 3:]
-    # The scene's origin is whole metres and the ego is near: float32 keeps a tenth of a
-    # millimetre here.
-    rotation = ego_rotations[0].astype(np.float32)
-    place = (ego_translations[0] - caster.scene.origin_city).astype(np.float32)
-    return SimulatedSweep(
+    sweep = SimulatedSweep(
         timestamp_ns=timestamp_ns,
-        points_ego=(points - place) @ rotation,
-        intensity=intensity[kept],
-        laser_number=(kept % num_rings).astype(np.uint8),
-        offset_ns=azimuth_ns[kept // num_rings].astype(np.int32),
-        materials=hits.material[kept],
+        points_ego=np.empty((len(kept), 3), np.float32),
+        intensity=np.empty(len(kept), np.uint8),
+        laser_number=np.empty(len(kept), np.uint8),
+        offset_ns=np.empty(len(kept), np.int32),
+        materials=np.empty(len(kept), np.uint8),
     )
+    collect(
+        kept,
+        num_rings,
+        rays,
+        range_m,
+        ego_rotations[0],
+        ego_translations[0] - caster.scene.origin_city,
+        intensity,
+        hits.material,
+        azimuth_ns,
+        sweep.points_ego,
+        sweep.intensity,
+        sweep.materials,
+        sweep.laser_number,
+        sweep.offset_ns,
+    )
+    return sweep
 
 
 @dataclass(frozen=True, eq=False)

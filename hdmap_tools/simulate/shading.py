@@ -6,7 +6,7 @@ fixed in the world, and the air between.
 
 from __future__ import annotations
 
-from math import cos, exp, floor, sin, sqrt
+from math import exp, floor, sqrt
 
 import numpy as np
 
@@ -71,97 +71,6 @@ def sky_colour(dx: float, dy: float, dz: float, light: Light) -> tuple[float, fl
         green += light.sun[1] * (0.33 * glow + disk)
         blue += light.sun[2] * (0.28 * glow + disk)
     return red, green, blue
-
-
-@compiled_fast
-def sun_rays(
-    first: int,
-    last: int,
-    rows: NDArrayAny,
-    rays: NDArrayFloat32,
-    t: NDArrayFloat32,
-    normal: NDArrayFloat32,
-    light: Light,
-    result: NDArrayFloat32,
-) -> None:
-    """Rays from hits towards a point of the sun's disk each, which blurs the shadows' edges."""
-    for j in range(first, last):
-        i = rows[j]
-        # Off the surface by more than float32 loses along a long ray.
-        lift = 0.01 + 1e-4 * t[i]
-        for k in range(3):
-            result[j, k] = rays[i, k] + t[i] * rays[i, 3 + k] + lift * normal[i, k]
-            result[j, 3 + k] = light.sun_direction[k] + light.sun_blur * (
-                2.0 * hash_unit(i, k, light.noise_seed) - 1.0
-            )
-
-
-@compiled_fast
-def sky_rays(
-    first: int,
-    last: int,
-    rows: NDArrayAny,
-    rays: NDArrayFloat32,
-    t: NDArrayFloat32,
-    normal: NDArrayFloat32,
-    seed: int,
-    result: NDArrayFloat32,
-) -> None:
-    """A ray each from hits to some place of the sky before them, more often where it counts more."""
-    for j in range(first, last):
-        i = rows[j]
-        lift = 0.01 + 1e-4 * t[i]
-        # A point of the ball that touches the surface: cosine-weighted directions.
-        up = 2.0 * hash_unit(i, 0, seed) - 1.0
-        around = 6.2831853 * hash_unit(i, 1, seed)
-        wide = sqrt(max(1.0 - up * up, 0.0))
-        ball = (wide * cos(around), wide * sin(around), up)
-        for k in range(3):
-            result[j, k] = rays[i, k] + t[i] * rays[i, 3 + k] + lift * normal[i, k]
-            result[j, 3 + k] = 1.02 * normal[i, k] + ball[k]
-
-
-@compiled_fast
-def spread_sunlight(
-    first: int,
-    last: int,
-    traced: NDArrayByte,
-    on_ground: NDArrayAny,
-    t: NDArrayFloat32,
-    normal: NDArrayFloat32,
-    sunlight: NDArrayFloat32,
-) -> None:
-    """Sunlight 0..1 of all pixels from those of every fourth one that were asked.
-
-    The mean over the neighbours, of three by three, that lie on the same surface: a fourth
-    of the rays, and edges of shadows as soft as two pixels.
-
-    Takes:
-        first, last: Image rows to do.
-        traced: (h, w) uint8: 0 in shadow, 1 in the sun, 2 not asked.
-        on_ground, t, normal: (h, w) and (h, w, 3) of the hits.
-        sunlight: (h, w) written.
-    """
-    height, width = traced.shape
-    for row in range(first, last):
-        for col in range(width):
-            total = 0.0
-            count = 0
-            for i in range(max(row - 1, 0), min(row + 2, height)):
-                for j in range(max(col - 1, 0), min(col + 2, width)):
-                    if traced[i, j] == 2 or on_ground[i, j] != on_ground[row, col]:
-                        continue
-                    if not on_ground[row, col]:
-                        alike = (
-                            normal[i, j, 0] * normal[row, col, 0]
-                            + normal[i, j, 1] * normal[row, col, 1]
-                            + normal[i, j, 2] * normal[row, col, 2]
-                        )
-                        if alike < 0.5 or abs(t[i, j] - t[row, col]) > 0.05 * t[row, col]:
-                            continue
-                    total += traced[i, j]
-                    count += 1
-            sunlight[row, col] = total / count if count > 0 else 1.0
 
 
 @compiled_fast
@@ -473,43 +382,3 @@ def shade(
             image[i, 0] = red * clear + light.haze[0] * (1.0 - clear)
             image[i, 1] = green * clear + light.haze[1] * (1.0 - clear)
             image[i, 2] = blue * clear + light.haze[2] * (1.0 - clear)
-
-
-@compiled_fast
-def finish(
-    first: int,
-    last: int,
-    width: int,
-    image: NDArrayFloat32,
-    falloff: NDArrayFloat32,
-    gains: NDArrayFloat,
-    shot: float,
-    read: float,
-    seed: int,
-    curve: NDArrayByte,
-    result: NDArrayByte,
-) -> None:
-    """Exposure, vignetting, noise of photons and electronics, and the tone curve, to uint8.
-
-    Takes:
-        first, last: Pixels to do.
-        width: Of the image.
-        image: (N, 3) light on the sensor.
-        falloff: (N,) light lost to the lens and to dirt on it.
-        gains: (3,) exposure times white balance.
-        shot, read: Noise of one sigma at full well and in the dark, 1 is full well.
-        seed: Of this image's noise.
-        curve: (4096,) uint8: the tone curve over the square root of 0..4 full wells.
-        result: (N, 3) written.
-    """
-    for i in range(first, last):
-        for c in range(3):
-            value = image[i, c] * falloff[i] * gains[c]
-            # Two uniforms and their sum: near enough to normal, four times as fast.
-            h = (i * 3 + c) * 668265263 + seed * 374761393
-            h = ((h ^ (h >> 13)) & 0xFFFFFFFF) * 1274126177
-            h = (h ^ (h >> 16)) & 0xFFFFFFFFFFFF
-            noise = ((h & 0xFFFF) + ((h >> 16) & 0xFFFF) + ((h >> 32) & 0xFFFF)) / 65536.0 - 1.5
-            value += 2.0 * noise * sqrt(read * read + shot * shot * max(value, 0.0))
-            at = int(sqrt(max(value, 0.0)) * 2047.5)
-            result[i, c] = curve[min(at, 4095)]

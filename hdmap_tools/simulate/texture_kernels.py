@@ -8,7 +8,7 @@ weighted texels do not meet: a fifth of the work of three channels of bytes.
 from __future__ import annotations
 
 from math import floor, log2
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -97,7 +97,7 @@ def next_level(first: int, last: int, finer: NDArrayAny, level: NDArrayAny) -> N
 
 
 @compiled_fast
-def _mean(a: int, b: int, c: int, d: int) -> int:
+def _mean(a: Any, b: Any, c: Any, d: Any) -> Any:
     total = _spread(a) + _spread(b) + _spread(c) + _spread(d)
     two = np.uint64(2)
     red = ((total & _LANE) + two) >> two
@@ -107,7 +107,7 @@ def _mean(a: int, b: int, c: int, d: int) -> int:
 
 
 @compiled_fast
-def _spread(texel: int) -> int:
+def _spread(texel: Any) -> Any:
     """Its three values 21 bits apart."""
     return (
         np.uint64(texel & _LOW)
