@@ -138,8 +138,8 @@ class Augment:
         image: Any = torch.from_numpy(np.ascontiguousarray(rgb[rows, columns])).permute(2, 0, 1)
         mask: Any = torch.from_numpy(np.ascontiguousarray(ids[rows, columns]))[None]
         image = functional.resize_image(image, size, v2.InterpolationMode.BILINEAR, antialias=True)
-        # Torchvision resizes a Mask with NEAREST, which takes the first of the pixels it
-        # could take: half a source pixel off from where the bilinear image has it.
+        # Torchvision resizes a Mask with NEAREST, up to a source pixel beside where the
+        # bilinear image has it; that is the width of a far lane mark.
         mask = functional.resize_image(mask, size, v2.InterpolationMode.NEAREST_EXACT)
         image = self._blurred(image, rng)
         pair = tv_tensors.Image(image), tv_tensors.Mask(mask)
