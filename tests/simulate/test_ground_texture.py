@@ -26,7 +26,7 @@ def mixed(rows: int, cols: int) -> NDArrayFloat:
 
 
 def albedo_of(codes: NDArrayFloat) -> NDArrayFloat:
-    return np.array([MATERIALS[Mat(c)].albedo for c in codes.ravel()]).reshape(*codes.shape, 3)
+    return np.array([MATERIALS[Mat(int(c))].albedo for c in codes.ravel()]).reshape(*codes.shape, 3)
 
 
 def seen(
