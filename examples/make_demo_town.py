@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 LAT, LON = 49.012, 8.432
-LANE, BICYCLE, PARKING, PAVEMENT = 3.25, 1.6, 2.2, 2.3
 CROSSING, APPROACH, TAPER = 6.0, 18.0, 3.0
 STRAIGHT_STEP, SAGITTA = 25.0, 0.02
 
@@ -29,6 +28,16 @@ DOUBLE = {"type": "line_thin", "subtype": "solid_solid"}
 KERB = {"type": "curbstone", "subtype": "high"}
 LOW_KERB = {"type": "curbstone", "subtype": "low"}
 VIRTUAL = {"type": "virtual"}
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Of the strips of a street."""
+
+    lane: float = 3.25
+    bicycle: float = 1.6
+    parking: float = 2.2
+    pavement: float = 2.3
 
 
 class Osm:
@@ -217,10 +226,10 @@ class Arm:
 
     def lane_edges(self, lane: int, is_inbound: bool) -> tuple[np.ndarray, np.ndarray]:
         """Left and right end of a lane at the gate."""
-        lanes = self.street.lanes
-        left, right = lane * LANE, (lane + 1) * LANE
+        lanes, width = self.street.lanes, self.street.widths.lane
+        left, right = lane * width, (lane + 1) * width
         if lane == -1:
-            left, right = lanes * LANE, self.street.kerb
+            left, right = lanes * width, self.street.kerb
         return self.point(left, is_inbound), self.point(right, is_inbound)
 
 
@@ -240,11 +249,13 @@ class Street:
         lanes: int = 1,
         center: dict[str, str] | None = None,
         limit: str = "50 km/h",
+        widths: Widths = Widths(),
+        has_bicycles: bool | None = None,
     ) -> None:
         self.osm, self.path, self.lanes, self.limit = osm, path, lanes, limit
-        self.center = center
-        self.has_bicycles = lanes > 1
-        self.kerb = lanes * LANE + (BICYCLE if self.has_bicycles else 0.0)
+        self.center, self.widths = center, widths
+        self.has_bicycles = lanes > 1 if has_bicycles is None else has_bicycles
+        self.kerb = lanes * widths.lane + (widths.bicycle if self.has_bicycles else 0.0)
         begin, end = gates[0], path.length - gates[1]
         fixed = sum(length for _, length, _, _ in sections if length is not None)
         shares = sum(length is None for _, length, _, _ in sections)
@@ -262,7 +273,7 @@ class Street:
         return np.array([self.path.beside(s, offset) for s in self.path.stations(begin, end)])
 
     def _section(self, kind: str, begin: float, end: float, left: bool, right: bool) -> None:
-        osm = self.osm
+        osm, widths = self.osm, self.widths
         bare = kind == "crossing"
         center = self.center or (DASHED if kind == "open" else SOLID)
         middle = osm.way(self.line(begin, end, 0.0), VIRTUAL if bare else center)
@@ -270,21 +281,22 @@ class Street:
             bounds = [middle]
             for lane in range(1, self.lanes):
                 divider = DASHED if kind == "open" else SOLID
-                xy = self.line(begin, end, side * lane * LANE)
+                xy = self.line(begin, end, side * lane * widths.lane)
                 bounds.append(osm.way(xy, VIRTUAL if bare else divider))
             kerb = LOW_KERB if bare else KERB
             if self.has_bicycles:
-                xy = self.line(begin, end, side * self.lanes * LANE)
+                xy = self.line(begin, end, side * self.lanes * widths.lane)
                 bounds.append(osm.way(xy, VIRTUAL if bare else WIDE))
             edge = self.line(begin, end, side * self.kerb)
             bounds.append(osm.way(edge, SOLID if has_parking else kerb))
             kerb_way = bounds[-1]
-            outer = self.line(begin, end, side * (self.kerb + PAVEMENT))
+            outer = self.line(begin, end, side * (self.kerb + widths.pavement))
             if has_parking:
                 a, b = begin + TAPER, end - TAPER
-                wide = self.line(a, b, side * (self.kerb + PARKING))
-                outer = self.line(a, b, side * (self.kerb + PARKING + PAVEMENT))
-                ends = [self.path.beside(s, side * (self.kerb + PAVEMENT)) for s in (begin, end)]
+                parked, walked = self.kerb + widths.parking, self.kerb + widths.pavement
+                wide = self.line(a, b, side * parked)
+                outer = self.line(a, b, side * (parked + widths.pavement))
+                ends = [self.path.beside(s, side * walked) for s in (begin, end)]
                 outer = np.concatenate([ends[:1], outer, ends[1:]])
                 kerb_way = osm.way(np.concatenate([edge[:1], wide, edge[-1:]]), KERB)
                 osm.area([bounds[-1], kerb_way], "parking")
@@ -319,7 +331,7 @@ class Street:
     def stop(self, arm: Arm, inside: float) -> int:
         """A stop line across the inbound lanes, so far from the gate; the street's own stop."""
         s = arm.s + arm.sign * inside
-        reach = self.lanes * LANE
+        reach = self.lanes * self.widths.lane
         points = [self.path.beside(s, arm.sign * o) for o in (0.1, reach - 0.1)]
         arm.stop_line = self.osm.way(np.array(points), {"type": "stop_line"})
         return arm.stop_line
@@ -332,7 +344,7 @@ class Street:
     def buildings(self, begin: float, side: int, lengths: list[float], depth: float) -> None:
         """A row of houses behind the pavement."""
         s = self.begin + begin
-        front = self.kerb + PARKING + PAVEMENT + 3.0
+        front = self.kerb + self.widths.parking + self.widths.pavement + 3.0
         for length in lengths:
             place, heading = self.path.at(s + length / 2.0)
             along, away = unit(heading), side * unit(heading + math.pi / 2)
@@ -356,9 +368,11 @@ def junction(osm: Osm, arms: list[Arm]) -> None:
         b = min((other for other in arms if other is not a), key=lambda other: turn_of(a, other))
         headings = a.outward + math.pi, b.outward
         rings = []
-        for extra in (0.0, PAVEMENT):
-            p = a.point(a.street.kerb + extra, True)
-            q = b.point(b.street.kerb + extra, False)
+        for has_walk in (False, True):
+            p, q = (
+                arm.point(arm.street.kerb + has_walk * arm.street.widths.pavement, arm is a)
+                for arm in (a, b)
+            )
             rings.append(bezier(p, headings[0], q, headings[1]))
         corner = osm.way(rings[0], KERB)
         osm.lanelet(corner, osm.way(rings[1], VIRTUAL), "walkway")
@@ -392,7 +406,7 @@ def junction(osm: Osm, arms: list[Arm]) -> None:
 
 def roundabout(osm: Osm, middle: np.ndarray, arms: list[Arm], inner: float, outer: float) -> None:
     """A ring driven counter-clockwise; whoever comes in gives way."""
-    half = math.radians(33.0)
+    half, pavement = math.radians(33.0), arms[0].street.widths.pavement
     arms = sorted(arms, key=lambda arm: wrap(arm.outward))
     at = [wrap(math.atan2(*(arm.point(0.0, True) - middle)[::-1])) for arm in arms]
 
@@ -409,7 +423,7 @@ def roundabout(osm: Osm, middle: np.ndarray, arms: list[Arm], inner: float, oute
         inside = [osm.way(arc(inner, *span), LOW_KERB) for span in (mouth, free)]
         yield_line = osm.way(arc(outer, *mouth), WIDE_DASHED)
         rim = osm.way(arc(outer, *free), KERB)
-        rim_walk = osm.way(arc(outer + PAVEMENT, *free), VIRTUAL)
+        rim_walk = osm.way(arc(outer + pavement, *free), VIRTUAL)
         ring_at.append(osm.lanelet(inside[0], yield_line, "road", speed_limit="30 km/h"))
         osm.lanelet(inside[1], rim, "road", speed_limit="30 km/h")
         osm.lanelet(rim, rim_walk, "walkway")
@@ -426,10 +440,10 @@ def roundabout(osm: Osm, middle: np.ndarray, arms: list[Arm], inner: float, oute
         ways = []
         for comes_in, angle in ((True, mouth[1]), (False, mouth[0])):
             left, right = arm.lane_edges(0, comes_in)
-            outside = arm.point(arm.street.kerb + PAVEMENT, comes_in)
+            outside = arm.point(arm.street.kerb + arm.street.widths.pavement, comes_in)
             a = osm.way(bend(left, angle, inner, comes_in, arm), VIRTUAL)
             b = osm.way(bend(right, angle, outer, comes_in, arm), KERB)
-            c = osm.way(bend(outside, angle, outer + PAVEMENT, comes_in, arm), VIRTUAL)
+            c = osm.way(bend(outside, angle, outer + pavement, comes_in, arm), VIRTUAL)
             made = osm.lanelet(a, b, "road", speed_limit="30 km/h")
             osm.lanelet(b, c, "walkway")
             if comes_in:
