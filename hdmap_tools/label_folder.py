@@ -5,17 +5,23 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from hdmap_tools.config import Config
 from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.readers.drive import Drive
+from hdmap_tools.readers.image import read_image
 from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
+from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.label_png import write_label_png
-from hdmap_tools.segmentation.precomputed import LABEL_SET_NAME, MODEL_NAME
+from hdmap_tools.segmentation.overlay import legend_picture, overlay_picture, write_picture
+from hdmap_tools.segmentation.precomputed import CONFUSION_NAME, LABEL_SET_NAME, MODEL_NAME
 from hdmap_tools.segmentation.segmenter import Segmenter
+
+OVERLAYS: Final = "overlays"
+"""In a folder of label images: pictures for people."""
 
 
 def write_label_folder(
@@ -26,9 +32,23 @@ def write_label_folder(
     *,
     cache: LabelCache | None = None,
     overwrite: bool = False,
+    overlays: bool = False,
     progress: SegmentProgress | None = None,
 ) -> dict[str, Any]:
-    """Segment all images of a drive; write their label images, label set and model's name.
+    """Segment all images of a drive; write their label images and all that they mean.
+
+    Beside them lie the label set, the model's name, and its confusion matrix where one came
+    with it.
+
+    Args:
+        drive: The drive.
+        segmenter: Makes the label images.
+        out: Folder to make.
+        config: Written beside the result.
+        cache: Where label images of earlier runs are.
+        overwrite: Replace an earlier result.
+        overlays: Also write pictures for people: `OVERLAYS` / camera / timestamp ``.jpg``.
+        progress: Told before each image and after the last.
 
     Returns:
         Number of images, share of pixels by label, milliseconds an image.
@@ -41,10 +61,19 @@ def write_label_folder(
             path.parent.mkdir(parents=True, exist_ok=True)
             write_label_png(path, labels)
             pixels += np.bincount(labels.reshape(-1), minlength=256)
+            if overlays:
+                rgb = read_image(image, drive.cameras[image.camera])
+                picture = overlay_picture(rgb, labels, segmenter.label_set)
+                write_picture(folder / OVERLAYS / f"{image.key}.jpg", picture)
+        if overlays:
+            write_picture(folder / OVERLAYS / "legend.png", legend_picture(segmenter.label_set))
         document = segmenter.label_set.model_dump_json(indent=2) + "\n"
         (folder / LABEL_SET_NAME).write_text(document, encoding="utf-8")
         made_by = json.dumps({"model": segmenter.name}, indent=2) + "\n"
         (folder / MODEL_NAME).write_text(made_by, encoding="utf-8")
+        confusion = confusion_of(segmenter)
+        if confusion is not None:
+            (folder / CONFUSION_NAME).write_text(confusion.to_json(), encoding="utf-8")
         (folder / CONFIG_NAME).write_text(config.to_yaml(), encoding="utf-8")
     return {
         "num_images": len(drive.images),

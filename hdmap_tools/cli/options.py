@@ -58,7 +58,8 @@ def segmentation_options(function: F) -> F:
         click.option("--cache", "cache_folder", type=PATH, help="Folder for kept label images."),
         click.option(
             "--label-set",
-            help="What the ids in those PNGs mean: a name or a JSON file [default: label_set.json there].",
+            help="What the ids in those PNGs (or of a model that does not say it) mean: a name or a "
+            "JSON file [default: label_set.json there].",
         ),
         click.option(
             "--labels", type=PATH, help="Folder of label PNGs, CAMERA/TIMESTAMP_NS.png, instead."
@@ -69,7 +70,37 @@ def segmentation_options(function: F) -> F:
         click.option(
             "--model",
             type=PATH,
-            help="ONNX or OpenVINO model [default: found in models/ by the drive].",
+            help="ONNX or OpenVINO model, or street-small [default: found in models/ by the drive, "
+            "else street-small].",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+def network_options(function: F) -> F:
+    """--input-size, --batch, --tile, --overlap and --no-undistort."""
+    for option in (
+        click.option(
+            "--no-undistort",
+            is_flag=True,
+            help="Show the network images as recorded, also of cameras with distortion.",
+        ),
+        click.option(
+            "--overlap", type=int, help="By how many pixels tiles overlap [default: 128]."
+        ),
+        click.option(
+            "--tile",
+            metavar="WIDTHxHEIGHT",
+            help="Cut large images into tiles, at their own scale.",
+        ),
+        click.option(
+            "--batch", type=int, help="Images or tiles at once, if the model takes several."
+        ),
+        click.option(
+            "--input-size",
+            metavar="WIDTHxHEIGHT",
+            help="Feed a model of which nothing is known at this size.",
         ),
     ):
         function = option(function)
@@ -150,6 +181,8 @@ _FIELD_OF_OPTION: Final = {
     "profile": "segmentation.profile",
     "labels": "segmentation.labels",
     "label_set": "segmentation.label_set",
+    "batch": "segmentation.batch",
+    "overlap": "segmentation.tile_overlap_px",
     "association": "association.method",
     "points": "association.points",
     "refine_poses": "points.refine_poses",
@@ -195,6 +228,11 @@ def resolve_config(given: dict[str, Any], **fixed: Any) -> Config:
         dotted.setdefault("association.method", "dense")
     if given.get("origin") is not None:
         dotted["export.origin"] = parse_origin(given["origin"])
+    for option, field in (("input_size", "input_size_px"), ("tile", "tile_px")):
+        if given.get(option) is not None:
+            dotted[f"segmentation.{field}"] = parse_size(given[option], option)
+    if given.get("no_undistort"):
+        dotted["segmentation.undistort"] = False
     dotted |= {name.replace("__", "."): value for name, value in fixed.items()}
     return load_config(given["config_path"], dotted)
 
@@ -223,6 +261,27 @@ def parse_origin(text: str) -> list[float]:
             "49.0123,8.4321,115."
         )
     return [*numbers, 0.0][:3]
+
+
+def parse_size(text: str, option: str) -> list[int]:
+    """WIDTHxHEIGHT as two numbers.
+
+    Args:
+        text: What was given.
+        option: Name of the parameter it was given for, for messages.
+
+    Raises:
+        ConfigError: If it is not two whole numbers above 0.
+    """
+    from hdmap_tools.errors import ConfigError
+
+    numbers = text.lower().split("x")
+    if len(numbers) != 2 or not all(n.isdecimal() and int(n) > 0 for n in numbers):
+        raise ConfigError(
+            f"--{option.replace('_', '-')} {text!r}: expected WIDTHxHEIGHT in pixels, for example "
+            "960x608."
+        )
+    return [int(number) for number in numbers]
 
 
 def label_cache(cache_folder: Path | None, no_cache: bool) -> LabelCache | None:

@@ -14,6 +14,8 @@ from hdmap_tools.cli import options
 @click.option("-o", "--out", type=options.PATH, required=True, help="Folder to make.")
 @options.drive_options
 @options.segmentation_options
+@options.network_options
+@click.option("--overlays", is_flag=True, help="Also write pictures with the labels' colours.")
 @options.overwrite_option
 @options.json_option
 @options.config_options
@@ -23,11 +25,17 @@ def command(ctx: click.Context, /, **given: Any) -> None:
 
     \b
     Examples:
-      hdmap segment path/to/drive -o labels --model road-segmentation-adas-0001.xml
+      hdmap segment path/to/drive -o labels --model street-small --overlays
+      hdmap segment path/to/drive -o labels --model net.onnx --label-set labels.json
       hdmap run path/to/drive -o out --labels labels
 
     Writes OUT/CAMERA/TIMESTAMP_NS.png (uint8 ids), OUT/label_set.json (what the ids
-    mean) and OUT/model.json (what made them).
+    mean), OUT/model.json (what made them), OUT/confusion.json (where it came with the
+    model) and with --overlays OUT/overlays/CAMERA/TIMESTAMP_NS.jpg.
+
+    Label images belong to the images as recorded. Of a camera with distortion the network
+    sees the rectified image, and each recorded pixel takes the label of the rectified pixel
+    in its direction; 255 where that shows nothing.
     """
     from hdmap_tools.label_folder import write_label_folder
     from hdmap_tools.opening import open_configured, require_images
@@ -45,6 +53,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             config,
             cache=options.label_cache(given["cache_folder"], given["no_cache"]),
             overwrite=given["overwrite"],
+            overlays=given["overlays"],
             progress=segmented,
         )
     options.write_json(given["json_path"], report, overwrite=given["overwrite"])
