@@ -103,3 +103,19 @@ def test_a_broken_map_frame_is_said(fails, here, simulated_drive):
     for text in ("{", "[]", '{"crs_wkt": 3}', '{"crs_wkt": "x", "offset_m": [0, 0, 0]}'):
         (here / "drive" / "map_frame.json").write_text(text)
         fails("info", "drive", says=("map_frame.json",))
+
+
+def test_images_alone(hdmap, here):
+    options = ("--lidar", "none", "--no-true-map", "--camera-height-m", "2.1")
+    code, out, err = hdmap("simulate", "demo_town", "-o", "images", *TINY, *options)
+    assert code == 0, err
+    assert "0 sweeps" in out
+    made = json.loads((here / "images/truth/simulation.json").read_text())
+    assert made["settings"]["lidar"] == "none"
+    assert not made["settings"]["true_map"]
+    (mount,) = made["ego_SE3_sensor"].values()
+    assert mount[2][3] == pytest.approx(2.1 - 0.33)
+    assert not (here / "images/sensors/lidar").exists()
+    assert not (here / "images/truth/vector_map.gpkg").exists()
+    code, out, _ = hdmap("info", "images")
+    assert code == 0
