@@ -9,6 +9,8 @@ from functools import cached_property
 from itertools import accumulate
 from typing import Protocol
 
+import numpy as np
+
 from hdmap_tools.errors import LabelError
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.labels.mappings import mapping_to
@@ -67,7 +69,7 @@ class _Relabelled:
 
     def read(self, index: int) -> tuple[NDArrayByte, NDArrayByte]:
         rgb, ids = self.pairs.read(index)
-        return rgb, self.table[ids]
+        return rgb, np.take(self.table, ids)
 
     def describe(self, index: int) -> str:
         return self.pairs.describe(index)

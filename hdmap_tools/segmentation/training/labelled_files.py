@@ -56,9 +56,7 @@ class LabelledFiles:
             )
         if self.void_id is not None:
             ids = np.where(ids == self.void_id, np.uint8(IGNORE_ID), ids)
-        # One look-up and one reduction, for this runs for every image of every epoch.
-        if _outside(self.label_set)[ids].any():
-            self.label_set.check(ids, f"Label image {label_path}")
+        self.label_set.check(ids, f"Label image {label_path}")
         return rgb, ids
 
     def describe(self, index: int) -> str:
@@ -145,11 +143,3 @@ def list_files(folder: Path, pattern: str, endings: tuple[str, ...]) -> list[Pat
         for path in folder.glob(pattern)
         if path.suffix.lower() in endings and not path.name.startswith(".")
     ]
-
-
-def _outside(label_set: LabelSet) -> NDArrayByte:
-    """(256,) 1 for ids that are neither of the set nor 255."""
-    table = np.ones(256, dtype=np.uint8)
-    table[: len(label_set)] = 0
-    table[IGNORE_ID] = 0
-    return table
