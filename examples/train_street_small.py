@@ -9,7 +9,7 @@ python examples/train_street_small.py measure OUT
 with the package, OUT/test through Lanelet2's mapping_example.osm (BSD-3-Clause; lanelet2_maps/res
 in its repository), a surveyed map. No drive of one part shares a map or a seed with another part.
 It goes on where it was stopped. `train` writes OUT/run and OUT/street-small.onnx, `measure`
-OUT/measured.json. What was made, with hashes, stands in OUT/data.json.
+OUT/measured-test.json. What was made, with hashes, stands in OUT/data.json.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ LIGHT = ("clear", "overcast", "haze", "wet", "dusk")
 WORN = ("default", "easy", "default", "hard")
 RIGS = ("front", "ring6", "front", "front3", "front", "front", "front3", "front", "ring6", "front")
 METRES_BETWEEN = {"front": 9.0, "front3": 15.0, "ring6": 25.0}
+MINUTES = 30
 HEIGHTS_M = (1.55, 1.3, 1.8, 1.55, 2.1, 1.4, 1.7)
 
 
@@ -235,12 +236,11 @@ def sha256(path: Path) -> str:
 
 def train(out: Path, options: list[str]) -> None:
     """Run the preset; what is given besides goes to `hdmap train`."""
-    hdmap(
-        "train",
-        *(f"drive:{out / 'train'}", "--val", f"drive:{out / 'val'}", "-o", out / "run"),
-        *("--preset", "small", *options),
-    )
-    hdmap("train", "--export", out / "run", out / "street-small.onnx")
+    run, model = out / "run", out / "street-small.onnx"
+    data = (f"drive:{out / 'train'}", "--val", f"drive:{out / 'val'}")
+    preset = ("--preset", "small", "--label-set", "street", "--max-minutes", MINUTES)
+    hdmap("train", *data, "-o", run, *preset, *options)
+    hdmap("train", "--export", run, model, "--name", "street-small", "--overwrite")
 
 
 def hdmap(*arguments: object) -> None:
@@ -250,17 +250,15 @@ def hdmap(*arguments: object) -> None:
 
 
 def measure(out: Path, model: Path, part: str, threads: int) -> None:
-    """IoU of each label over all pixels of a part, and milliseconds an image."""
+    """IoU of each label over all pixels of a part, by weather and such, and milliseconds an image."""
     import numpy as np
 
     from hdmap_tools.segmentation.measure_confusion import measure_confusion
     from hdmap_tools.segmentation.open_segmenter import open_model
-    from hdmap_tools.segmentation.training.pairs import open_pairs, relabelled
+    from hdmap_tools.segmentation.training.pairs import open_drives, relabelled
 
     segmenter = open_model(model, None, {}, threads=threads)
-    pairs = relabelled(open_pairs(f"drive:{out / part}"), segmenter.label_set.name)
-    segmenter.segment_rgb(pairs.read(0)[0])
-    taken_s = []
+    taken_s: list[float] = []
 
     def segment(rgb: Any) -> Any:
         begin = time.perf_counter()
@@ -268,29 +266,41 @@ def measure(out: Path, model: Path, part: str, threads: int) -> None:
         taken_s.append(time.perf_counter() - begin)
         return labels
 
-    matrix = measure_confusion(
-        (pairs.read(k) for k in range(len(pairs))),
-        segment,
-        pairs.label_set,
-        segmenter.label_set,
-        f"{model.name} on {part}",
-    )
-    counts = matrix.counts.astype(float)
-    hits = np.diag(counts)
-    either = counts.sum(axis=0) + counts.sum(axis=1) - hits
-    ious = dict(zip(segmenter.label_set.names, np.round(hits / either, 4).tolist(), strict=True))
+    counts: dict[str, Any] = {"all": 0}
+    for drive in (drive for drive in all_drives() if drive.part == part):
+        pairs = relabelled(open_drives([out / part / drive.name]), segmenter.label_set.name)
+        read = (pairs.read(k) for k in range(len(pairs)))
+        matrix = measure_confusion(read, segment, pairs.label_set, segmenter.label_set, drive.name)
+        told_apart = [drive.settings[k] for k in ("weather", "difficulty", "camera_rig")]
+        for group in ("all", *told_apart):
+            counts[group] = counts.get(group, 0) + matrix.counts
+    names = segmenter.label_set.names
     document = {
         "model": {"name": model.name, "sha256": sha256(model), "bytes": model.stat().st_size},
         "measured_on": part,
-        "images": len(pairs),
-        "mean_iou": round(float(np.mean(list(ious.values()))), 4),
-        "iou": ious,
-        "ms_an_image_median": round(1000.0 * float(np.median(taken_s)), 1),
+        "images": len(taken_s),
+        # The first image pays for memory and threads.
+        "ms_an_image_median": round(1000.0 * float(np.median(taken_s[1:])), 1),
         "threads": threads,
+        "iou": {group: ious(found, names) for group, found in counts.items()},
     }
     text = json.dumps(document, indent=2) + "\n"
-    (out / "measured.json").write_text(text, encoding="utf-8")
+    (out / f"measured-{part}.json").write_text(text, encoding="utf-8")
     print(text)
+
+
+def ious(counts: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """Of each label that is there or was said to be, and their mean.
+
+    Args:
+        counts: (L, L) pixels, rows true, columns predicted.
+        names: Of the L labels.
+    """
+    hits = counts.diagonal()
+    either = counts.sum(axis=0) + counts.sum(axis=1) - hits
+    found = {name: float(hits[k] / either[k]) for k, name in enumerate(names) if either[k]}
+    mean = sum(found.values()) / len(found)
+    return {k: round(iou, 4) for k, iou in {"mean": mean, **found}.items()}
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hdmap_tools.readers.av2 import read_av2
@@ -142,6 +143,12 @@ def test_another_map_is_not_taken_for_the_one_that_is_held_out(recipe, tmp_path)
 def test_the_held_out_map_is_the_real_one(recipe, data_root):
     found = recipe.sha256_of_text(data_root / "lanelet2" / "mapping_example.osm")
     assert found == recipe.MAPPING_EXAMPLE_SHA256
+
+
+def test_iou_leaves_labels_out_that_nobody_saw(recipe):
+    counts = np.array([[6, 2, 0], [0, 4, 0], [0, 0, 0]])
+    found = recipe.ious(counts, ("road", "sky", "pole"))
+    assert found == {"mean": round((6 / 8 + 4 / 6) / 2, 4), "road": 0.75, "sky": 0.6667}
 
 
 def test_without_a_command_it_says_how_it_is_used():
