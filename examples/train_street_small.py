@@ -24,11 +24,13 @@ import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 PARTS = ("train", "val", "test")
+DRAWN_BY = ("hdmap_tools", "numpy", "numba", "open3d-cpu", "opencv-python-headless", "shapely")
 TOWNS, GRIDS = range(1, 13), range(1, 9)
 NUM_MADE_UP = len(TOWNS) + len(GRIDS)
 MAPPING_EXAMPLE_SHA256 = "11561c763ed50322185139ec2dd041d6da72e1bd4e5fc3bb66f6b340d92c088f"
@@ -171,6 +173,7 @@ def describe_data(out: Path, worlds: dict[str, Path], drives: list[Drive]) -> di
     maps = {k: sha256_of_text(path) for k, path in sorted(worlds.items())}
     document: dict[str, Any] = {"recipe_sha256": recipe_sha256(maps, drives)}
     document |= {"labels_sha256": "", "images_sha256": "", "maps_sha256": maps}
+    document["made_with"] = {package: version(package) for package in DRAWN_BY}
     for part in PARTS:
         pixels: Counter[int] = Counter()
         number = 0
