@@ -93,7 +93,7 @@ def find_corners(gray: NDArrayByte, board: Board) -> NDArrayFloat | None:
     import cv2
 
     size = (board.columns, board.rows)
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     found, corners = cv2.findChessboardCornersSB(gray, size, flags=flags)
     if not found:
         # Slower to give up on small and weakly lit boards.

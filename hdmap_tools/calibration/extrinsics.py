@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from hdmap_tools.calibration.pairs import FEWEST_PAIRS, Pairs, require_usable
-from hdmap_tools.calibration.pose_ransac import find_pose
+from hdmap_tools.calibration.pose_ransac import MIN_SHARE, find_pose
 from hdmap_tools.calibration.pose_refine import RefinedPose, refine_pose
 from hdmap_tools.calibration.spread import require_spread
 from hdmap_tools.errors import CalibrationError, ConfigError
@@ -18,9 +18,7 @@ from hdmap_tools.types import NDArrayFloat
 MAX_ERROR_PX: Final = 5.0
 """Ten times the noise of a careful click; wrong pairs are further off almost always."""
 
-_MIN_SHARE: Final = 0.3
-"""Fewer agreeing pairs may agree by chance."""
-_WEAK_SHARE: Final = 0.5
+_WEAK_SHARE: Final = 0.6
 _WEAK_DEG: Final = 0.1
 _WEAK_M: Final = 0.02
 _MIRROR: Final = np.array([1.0, -1.0, 1.0])
@@ -82,7 +80,7 @@ def estimate_extrinsics(
     require_usable(pairs, camera)
     require_spread(pairs.points, f"The {len(pairs)} points")
     found = find_pose(pairs.points, pairs.uv, camera, max_error_px, np.random.default_rng(seed))
-    fewest = max(FEWEST_PAIRS, int(np.ceil(_MIN_SHARE * len(pairs))))
+    fewest = max(FEWEST_PAIRS, int(np.ceil(MIN_SHARE * len(pairs))))
     if found is None or found[1].sum() < fewest:
         raise _no_agreement(
             pairs, camera, 0 if found is None else int(found[1].sum()), max_error_px, seed
@@ -116,7 +114,7 @@ def _no_agreement(
         )
     return CalibrationError(
         f"Only {num_agreeing} of {len(pairs)} pairs agree with one pose within {max_error_px:g} px; expected at "
-        f"least {max(FEWEST_PAIRS, int(np.ceil(_MIN_SHARE * len(pairs))))}, with the points in front of the camera. "
+        f"least {max(FEWEST_PAIRS, int(np.ceil(MIN_SHARE * len(pairs))))}, with the points in front of the camera. "
         "Check that each pixel shows its point, that the intrinsics are of this camera, and the frame of "
         "the points; for coarse pairs raise the allowed error (--max-error-px)."
     )

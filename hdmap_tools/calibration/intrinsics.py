@@ -6,7 +6,8 @@ the camera found without them has to predict half of their corners from the othe
 
 Source:
     Zhang, A Flexible New Technique for Camera Calibration, PAMI 2000; OpenCV's
-    `calibrateCameraExtended`.
+    `calibrateCamera`. Its own standard deviations come from a pseudo-inverse: for boards all
+    parallel to the picture they are small where nothing is known. So they are computed here.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ _FOLDS: Final = 5
 _MAX_SIGMA_SHARE: Final = 0.05
 """Of the focal length: beyond it the views do not determine the camera."""
 _WEAK_SIGMA_SHARE: Final = 0.002
+_MIN_TILT_DEG: Final = 5.0
+_WEAK_TILT_DEG: Final = 20.0
+_SMALLEST_EIGENVALUE: Final = 1e-14
+"""Of the scaled information; good views have 1e-7 because the three radial terms are alike."""
 _BAD_VIEW_PX: Final = 0.5
 _BAD_VIEW_FACTOR: Final = 3.0
 _MIN_COVERAGE: Final = 0.5
@@ -98,7 +103,6 @@ class Intrinsics:
 class _Fit:
     matrix: NDArrayFloat
     distortion: NDArrayFloat
-    sigma: NDArrayFloat
     rvecs: list[NDArrayFloat]
     tvecs: list[NDArrayFloat]
 
@@ -124,9 +128,11 @@ def estimate_intrinsics(
             f"{_ADVISED_VIEWS} to 20, at tilts of 20 to 45 degrees all over the picture."
         )
     fit = _fit(views, board, size_px)
-    camera = _camera(fit, size_px, name)
-    _require_determined(fit, size_px)
+    _require_tilts(fit)
     residuals = [_distances(fit, k, view, board) for k, view in enumerate(views)]
+    sigma = _sigma(fit, board, np.concatenate(residuals))
+    _require_determined(fit, sigma, size_px)
+    camera = _camera(fit, size_px, name)
     held_out = _held_out_distances(views, board, size_px)
     errors = tuple(
         ViewError(
@@ -141,12 +147,12 @@ def estimate_intrinsics(
     covered = _coverage(views, size_px)
     return Intrinsics(
         camera=camera,
-        sigma=fit.sigma,
+        sigma=sigma,
         rms_px=_rms(np.concatenate(residuals)),
         held_out_rms_px=None if held_out is None else _rms(np.concatenate(held_out)),
         coverage=covered,
         views=errors,
-        warnings=tuple(_warnings(fit, errors, covered)),
+        warnings=tuple(_warnings(fit, sigma, errors, covered)),
     )
 
 
@@ -159,8 +165,11 @@ def _fit(views: Sequence[View], board: Board, size_px: tuple[int, int]) -> _Fit:
     # OpenCV reads these only with flags that are not set here.
     matrix: Any = np.eye(3)
     distortion: Any = np.zeros(5)
+    threads = cv2.getNumThreads()
     try:
-        found = cv2.calibrateCameraExtended(
+        # With several threads sums differ from run to run in their last digits.
+        cv2.setNumThreads(1)
+        found = cv2.calibrateCamera(
             [corners] * len(views), seen, size_px, matrix, distortion, criteria=stop
         )
     except cv2.error as error:
@@ -168,12 +177,13 @@ def _fit(views: Sequence[View], board: Board, size_px: tuple[int, int]) -> _Fit:
             f"{len(views)} views of the board do not determine a camera ({error.err}); take more, "
             "at tilts of 20 to 45 degrees all over the picture."
         ) from error
-    _, matrix, distortion, rvecs, tvecs, sigma = found[:6]
+    finally:
+        cv2.setNumThreads(threads)
+    _, matrix, distortion, rvecs, tvecs = found
     # Shapes differ between OpenCV 4 and 5.
     return _Fit(
         matrix=np.asarray(matrix, dtype=np.float64).reshape(3, 3),
         distortion=np.asarray(distortion, dtype=np.float64).reshape(-1)[:5],
-        sigma=np.asarray(sigma, dtype=np.float64).reshape(-1)[: len(PARAMETERS)],
         rvecs=[np.asarray(r, dtype=np.float64).reshape(3) for r in rvecs],
         tvecs=[np.asarray(t, dtype=np.float64).reshape(3) for t in tvecs],
     )
@@ -194,10 +204,57 @@ def _camera(fit: _Fit, size_px: tuple[int, int], name: str) -> PinholeCamera:
     )
 
 
-def _require_determined(fit: _Fit, size_px: tuple[int, int]) -> None:
+def _require_tilts(fit: _Fit) -> None:
+    """Refuse views of one orientation: each orientation tells two things of the four sought.
+
+    Noise tilts the fitted boards a little, so that the equations alone do not show it.
+    """
+    widest = _widest_angle_deg(fit)
+    if widest < _MIN_TILT_DEG:
+        raise CalibrationError(
+            f"All boards stand the same way: their normals differ by at most {widest:.1f} degrees, and so the "
+            "views do not determine the focal length. Tilt the board by 20 to 45 degrees to several sides."
+        )
+
+
+def _widest_angle_deg(fit: _Fit) -> float:
+    """Between the normals of any two boards."""
+    from scipy.spatial.transform import Rotation
+
+    normals = Rotation.from_rotvec(np.array(fit.rvecs)).as_matrix()[:, :, 2]
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
+
+
+def _sigma(fit: _Fit, board: Board, distances: NDArrayFloat) -> NDArrayFloat:
+    """(9,) of `PARAMETERS`, the poses of the boards being unknown too; infinite if undetermined."""
+    import cv2
+
+    num = len(PARAMETERS)
+    information = np.zeros((num, num))
+    scale = np.zeros(num)
+    for rvec, tvec in zip(fit.rvecs, fit.tvecs, strict=True):
+        _, jacobian = cv2.projectPoints(board.corners_board, rvec, tvec, fit.matrix, fit.distortion)
+        # Columns: turn, shift, focal lengths, principal point, distortion.
+        jacobian = np.asarray(jacobian, dtype=np.float64)
+        of_pose, of_camera = jacobian[:, :6], jacobian[:, 6 : 6 + num]
+        basis, _ = np.linalg.qr(of_pose)
+        # What a pose can take up of a change of the camera tells nothing about the camera.
+        left = of_camera - basis @ (basis.T @ of_camera)
+        information += left.T @ left
+        scale += (of_camera**2).sum(axis=0)
+    scale = np.sqrt(scale)
+    scaled = information / np.outer(scale, scale)
+    if np.linalg.eigvalsh(scaled)[0] < _SMALLEST_EIGENVALUE:
+        return np.full(num, np.inf)
+    free = 2 * len(distances) - num - 6 * len(fit.rvecs)
+    variance = float((distances**2).sum()) / max(free, 1)
+    return np.asarray(np.sqrt(variance * np.diag(np.linalg.inv(scaled))) / scale)
+
+
+def _require_determined(fit: _Fit, sigma: NDArrayFloat, size_px: tuple[int, int]) -> None:
     focal = np.array([fit.matrix[0, 0], fit.matrix[1, 1]])
-    share = fit.sigma[:2] / focal
-    if not np.isfinite(fit.sigma).all() or (share > _MAX_SIGMA_SHARE).any():
+    share = sigma[:2] / focal
+    if not np.isfinite(sigma).all() or (share > _MAX_SIGMA_SHARE).any():
         raise CalibrationError(
             f"The views do not determine the focal length: {focal[0]:.0f} and {focal[1]:.0f} px with "
             f"standard deviations of {100 * share[0]:.1f} and {100 * share[1]:.1f} %. Boards parallel to "
@@ -284,15 +341,22 @@ def _rms(distances: NDArrayFloat) -> float:
     return float(np.sqrt(np.mean(np.square(distances))))
 
 
-def _warnings(fit: _Fit, errors: Sequence[ViewError], covered: float) -> list[str]:
+def _warnings(
+    fit: _Fit, sigma: NDArrayFloat, errors: Sequence[ViewError], covered: float
+) -> list[str]:
     said = []
     if len(errors) < _ADVISED_VIEWS:
         said.append(f"only {len(errors)} views; {_ADVISED_VIEWS} to 20 are advised")
-    share = float((fit.sigma[:2] / (fit.matrix[0, 0], fit.matrix[1, 1])).max())
+    share = float((sigma[:2] / (fit.matrix[0, 0], fit.matrix[1, 1])).max())
     if share > _WEAK_SIGMA_SHARE:
         said.append(
             f"the focal length is known to {100 * share:.2f} % (one standard deviation); tilt the "
             "board more, and bring it nearer"
+        )
+    if (widest := _widest_angle_deg(fit)) < _WEAK_TILT_DEG:
+        said.append(
+            f"the boards' normals differ by at most {widest:.0f} degrees; tilt the board more, to "
+            "several sides"
         )
     if covered < _MIN_COVERAGE:
         said.append(

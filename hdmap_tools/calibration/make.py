@@ -177,6 +177,43 @@ def make_check(
     return _drawn(overlay, camera, str(image.path))
 
 
+def make_check_of_files(
+    image_path: Path,
+    points_path: Path,
+    out: Path,
+    calibration: Path,
+    *,
+    name: str | None = None,
+    max_range_m: float = 60.0,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Draw a point cloud in the ego frame into a picture, where there is no drive yet.
+
+    Args:
+        image_path: Picture of the camera's size.
+        points_path: Point cloud (.pcd, .ply, .las, .laz), ego frame, metres.
+        out: PNG to write.
+        calibration: With the camera's intrinsics and mount.
+        name: Which camera, where there are several.
+        max_range_m: Points further away are not drawn.
+        overwrite: Whether an older picture may be replaced.
+
+    Returns:
+        What was drawn.
+
+    Raises:
+        HDMapError: If one of them cannot be read, or the picture is of another size.
+    """
+    from hdmap_tools.point_map.point_files import read_point_file
+
+    camera = _mounted_camera(calibration, name)
+    rgb = read_image(ImageRef(camera.name, 0, image_path), camera)
+    points = read_point_file(points_path).points
+    overlay = overlay_points(rgb, camera, points, max_range_m=max_range_m)
+    write_png(overlay.picture, out, overwrite=overwrite)
+    return _drawn(overlay, camera, str(image_path))
+
+
 def _chosen_image(drive: Drive, name: str | None, index: int) -> ImageRef:
     cameras = sorted({image.camera for image in drive.images})
     if not cameras:
@@ -191,15 +228,14 @@ def _chosen_image(drive: Drive, name: str | None, index: int) -> ImageRef:
     return images[index]
 
 
-def _mounted_camera(path: Path, name: str) -> PinholeCamera:
+def _mounted_camera(path: Path, name: str | None) -> PinholeCamera:
     known = read_calibration(path)
-    if name not in known.cameras and len(known.cameras) == 1:
-        (name,) = known.cameras  # one camera needs no name
-    if name not in known.mounts:
+    camera = known.camera(name, path)
+    if camera.name not in known.mounts:
         raise CalibrationError(
-            f"{path} says no mount of camera {name}; find it with `hdmap calibrate extrinsics`."
+            f"{path} says no mount of camera {camera.name}; find it with `hdmap calibrate extrinsics`."
         )
-    return known.camera(name, path)
+    return camera
 
 
 def _points_at(drive: Drive, image: ImageRef) -> NDArrayFloat:

@@ -7,14 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from hdmap_tools.errors import ShapeError
+from hdmap_tools.errors import ConfigError, ShapeError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.types import NDArrayByte, NDArrayFloat, NDArrayInt
 from hdmap_tools.view.canvas import put_text
 from hdmap_tools.view.palette import INK, PAPER
 
 _BAR_PX: Final = 40
-_TICKS: Final = 5
+_TICKS: Final = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,10 @@ def overlay_points(
 
     Raises:
         ShapeError: If the picture is not of the camera's size.
+        ConfigError: If max_range_m is not positive.
     """
+    if not (np.isfinite(max_range_m) and max_range_m > 0):
+        raise ConfigError(f"max_range_m is {max_range_m}; expected a positive number of metres.")
     if rgb.shape != (camera.height_px, camera.width_px, 3) or rgb.dtype != np.uint8:
         raise ShapeError(
             f"Camera {camera.name} is calibrated for ({camera.height_px}, {camera.width_px}, 3) uint8, found "
@@ -65,8 +68,8 @@ def overlay_points(
     is_drawn = seen.is_valid & (range_m <= max_range_m)
     order = np.argsort(-range_m[is_drawn], kind="stable")
     pixels = np.rint(seen.uv[is_drawn][order]).astype(np.int64)
-    colors = _range_colors(range_m[is_drawn][order] / max_range_m)
-    radius = max(round(camera.width_px / 800), 1) if radius_px is None else radius_px
+    colors = _range_colors(_share(range_m[is_drawn][order], max_range_m))
+    radius = max(round(camera.width_px / 640), 1) if radius_px is None else radius_px
     picture = rgb.copy()
     _stamp(picture, pixels, colors, radius)
     legend = _legend(camera.width_px, max_range_m)
@@ -86,6 +89,11 @@ def _stamp(picture: NDArrayByte, pixels: NDArrayInt, colors: NDArrayByte, radius
     # Numpy does not promise which of repeated indices wins: keep the last of each.
     places, last = np.unique(flat[::-1], return_index=True)
     picture.reshape(-1, 3)[places] = colors[of_dot[::-1][last]]
+
+
+def _share(range_m: NDArrayFloat, max_range_m: float) -> NDArrayFloat:
+    """Along the colours: the root, because most points are near."""
+    return np.asarray(np.sqrt(np.clip(range_m / max_range_m, 0.0, 1.0)))
 
 
 def _range_colors(share: NDArrayFloat) -> NDArrayByte:
@@ -109,9 +117,9 @@ def _legend(width_px: int, max_range_m: float) -> NDArrayByte:
     if bar.shape[1] < 2:
         return legend
     bar[:] = _range_colors(np.linspace(0, 1, bar.shape[1]))[None]
-    for share in np.linspace(0, 1, _TICKS + 1):
-        at = margin + share * (bar.shape[1] - 1)
-        text = f"{share * max_range_m:.0f} m"
+    for share in _TICKS:
+        at = margin + float(_share(np.array(share), 1.0)) * (bar.shape[1] - 1)
+        text = f"{share * max_range_m:.3g} m"
         put_text(
             legend, text, (at, height - 6 * scale), size=0.45 * scale, color=INK, anchor="middle"
         )

@@ -15,19 +15,33 @@ from hdmap_tools.types import NDArrayBool, NDArrayFloat
 _SAMPLE: Final = 6
 """One more than the least that fixes a pose and EPnP's four unknown weights: steadier with noise."""
 _CONFIDENCE: Final = 0.9999
-_MAX_TRIALS: Final = 20_000
+MIN_SHARE: Final = 0.4
+"""Of pairs that must agree: fewer may agree by chance, and take ten times as long to find."""
 _POLISHING_ROUNDS: Final = 5
 _FLAT: Final = 1e-3
 """Samples flatter than this share of their size are not tried: EPnP fails on planes."""
 
 
-def distances_px(points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera) -> NDArrayFloat:
-    """(N,) pixels between where points (N, 3), ego frame, are seen and where they should be.
+def distances_px(
+    points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera, mount: SE3
+) -> NDArrayFloat:
+    """(N,) pixels between where points are seen and where they should be.
 
     Infinite for points that the camera cannot see: behind it, or beyond its lens.
+
+    Args:
+        points: (N, 3) metres, ego frame.
+        uv: (N, 2) pixels.
+        lens: The camera with the identity for a mount (`as_lens`).
+        mount: ``ego_SE3_cam``.
     """
-    seen = camera.project(points)
+    seen = lens.project(mount.inverse().transform_from(points))
     return np.asarray(np.nan_to_num(np.linalg.norm(seen.uv - uv, axis=1), nan=np.inf))
+
+
+def as_lens(camera: PinholeCamera) -> PinholeCamera:
+    """The camera in its own frame: made once, because a camera checks its distortion when made."""
+    return replace(camera, ego_SE3_cam=SE3.identity())
 
 
 def find_pose(
@@ -53,18 +67,19 @@ def find_pose(
         Lepetit et al., EPnP, IJCV 2009; Fischler and Bolles, RANSAC, 1981; Chum, Matas and
         Kittler, Locally Optimized RANSAC, 2003.
     """
+    lens = as_lens(camera)
     best: tuple[SE3, NDArrayBool] | None = None
-    most, trials, needed = 0, 0, _MAX_TRIALS
+    most, trials, needed = 0, 0, _trials_needed(MIN_SHARE)
     while trials < needed:
         trials += 1
         sample = rng.choice(len(points), size=min(_SAMPLE, len(points)), replace=False)
-        mount = _epnp(points[sample], uv[sample], camera)
+        mount = _epnp(points[sample], uv[sample], lens)
         if mount is None:
             continue
-        agrees = _agreeing(points, uv, camera, mount, max_error_px)
+        agrees = distances_px(points, uv, lens, mount) <= max_error_px
         if agrees.sum() <= most:
             continue
-        mount, agrees = _polished(points, uv, camera, mount, agrees, max_error_px)
+        mount, agrees = _polished(points, uv, lens, mount, agrees, max_error_px)
         best, most = (mount, agrees), int(agrees.sum())
         needed = min(needed, _trials_needed(most / len(points)))
     return best
@@ -73,7 +88,7 @@ def find_pose(
 def _polished(
     points: NDArrayFloat,
     uv: NDArrayFloat,
-    camera: PinholeCamera,
+    lens: PinholeCamera,
     mount: SE3,
     agrees: NDArrayBool,
     max_error_px: float,
@@ -82,24 +97,17 @@ def _polished(
     for _ in range(_POLISHING_ROUNDS):
         if agrees.sum() < _SAMPLE:
             break
-        again = _epnp(points[agrees], uv[agrees], camera)
+        again = _epnp(points[agrees], uv[agrees], lens)
         if again is None:
             break
-        now = _agreeing(points, uv, camera, again, max_error_px)
+        now = distances_px(points, uv, lens, again) <= max_error_px
         if now.sum() <= agrees.sum():
             break
         mount, agrees = again, now
     return mount, agrees
 
 
-def _agreeing(
-    points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount: SE3, max_error_px: float
-) -> NDArrayBool:
-    seen_by = replace(camera, ego_SE3_cam=mount)
-    return np.asarray(distances_px(points, uv, seen_by) <= max_error_px)
-
-
-def _epnp(points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera) -> SE3 | None:
+def _epnp(points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera) -> SE3 | None:
     import cv2
 
     extents = principal_extents(points)
@@ -111,8 +119,8 @@ def _epnp(points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera) -> SE3 
         done, rvec, tvec = cv2.solvePnP(
             np.ascontiguousarray(points - middle),
             np.ascontiguousarray(uv),
-            camera.matrix,
-            np.array(camera.distortion),
+            lens.matrix,
+            np.array(lens.distortion),
             flags=cv2.SOLVEPNP_EPNP,
         )
     except cv2.error:
@@ -131,6 +139,4 @@ def _trials_needed(share: float) -> int:
     clean = share**_SAMPLE
     if clean >= 1.0 - 1e-12:
         return 1
-    if clean <= 1e-12:
-        return _MAX_TRIALS
-    return int(min(np.ceil(np.log(1 - _CONFIDENCE) / np.log1p(-clean)), _MAX_TRIALS))
+    return int(np.ceil(np.log(1 - _CONFIDENCE) / np.log1p(-clean)))

@@ -8,12 +8,12 @@ taken from the residuals themselves, because nobody knows how well a person clic
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from hdmap_tools.calibration.pose_ransac import distances_px
+from hdmap_tools.calibration.pose_ransac import as_lens, distances_px
 from hdmap_tools.errors import CalibrationError
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
@@ -79,27 +79,28 @@ def refine_pose(
     Raises:
         CalibrationError: If fewer than four pairs remain, or they leave a direction open.
     """
+    lens = as_lens(camera)
     mount, seen_sets = start, set()
     for _ in range(_ROUNDS):
         _require_enough(is_used)
         seen_sets.add(is_used.tobytes())
-        mount = _fitted(points[is_used], uv[is_used], camera, mount)
-        distances = distances_px(points, uv, replace(camera, ego_SE3_cam=mount))
+        mount = _fitted(points[is_used], uv[is_used], lens, mount)
+        distances = distances_px(points, uv, lens, mount)
         gate = max(_GATE_SIGMAS * _robust_sigma(distances[is_used]), _SMALLEST_GATE_PX)
         now = distances <= gate
         if now.tobytes() in seen_sets:  # settled, or turning in a circle
             break
         is_used = now
     _require_enough(is_used)
-    residuals = _residuals(np.zeros(NUM_UNKNOWNS), points[is_used], uv[is_used], camera, mount)
+    residuals = _residuals(np.zeros(NUM_UNKNOWNS), points[is_used], uv[is_used], lens, mount)
     free = 2 * int(is_used.sum()) - NUM_UNKNOWNS
     variance = float(residuals @ residuals) / free / _TAIL_SHARE
     return RefinedPose(
         ego_SE3_cam=mount,
-        covariance=_covariance(points[is_used], uv[is_used], camera, mount, variance),
+        covariance=_covariance(points[is_used], uv[is_used], lens, mount, variance),
         sigma_px=float(np.sqrt(variance)),
         is_used=is_used,
-        distances_px=distances_px(points, uv, replace(camera, ego_SE3_cam=mount)),
+        distances_px=distances_px(points, uv, lens, mount),
     )
 
 
@@ -119,14 +120,14 @@ def _moved(mount: SE3, step: NDArrayFloat) -> SE3:
 
 
 def _residuals(
-    step: NDArrayFloat, points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount: SE3
+    step: NDArrayFloat, points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera, mount: SE3
 ) -> NDArrayFloat:
     """(2 N,) pixels; large where a step would put a point out of sight, so that it is not taken."""
-    seen = replace(camera, ego_SE3_cam=_moved(mount, step)).project(points)
+    seen = lens.project(_moved(mount, step).inverse().transform_from(points))
     return np.asarray(np.nan_to_num(seen.uv - uv, nan=_NOT_SEEN_PX)).ravel()
 
 
-def _fitted(points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount: SE3) -> SE3:
+def _fitted(points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera, mount: SE3) -> SE3:
     from scipy.optimize import least_squares
 
     found: Any = least_squares(
@@ -138,29 +139,29 @@ def _fitted(points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount
         xtol=1e-12,
         ftol=1e-12,
         gtol=1e-12,
-        args=(points, uv, camera, mount),
+        args=(points, uv, lens, mount),
     )
     return _moved(mount, found.x)
 
 
 def _jacobian(
-    step: NDArrayFloat, points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount: SE3
+    step: NDArrayFloat, points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera, mount: SE3
 ) -> NDArrayFloat:
     """(2 N, 6), by central differences."""
     columns = []
     for k in range(NUM_UNKNOWNS):  # six unknowns, each over all points at once
         change = np.zeros(NUM_UNKNOWNS)
         change[k] = _STEPS[k]
-        after = _residuals(step + change, points, uv, camera, mount)
-        before = _residuals(step - change, points, uv, camera, mount)
+        after = _residuals(step + change, points, uv, lens, mount)
+        before = _residuals(step - change, points, uv, lens, mount)
         columns.append((after - before) / (2 * _STEPS[k]))
     return np.column_stack(columns)
 
 
 def _covariance(
-    points: NDArrayFloat, uv: NDArrayFloat, camera: PinholeCamera, mount: SE3, variance: float
+    points: NDArrayFloat, uv: NDArrayFloat, lens: PinholeCamera, mount: SE3, variance: float
 ) -> NDArrayFloat:
-    jacobian = _jacobian(np.zeros(NUM_UNKNOWNS), points, uv, camera, mount)
+    jacobian = _jacobian(np.zeros(NUM_UNKNOWNS), points, uv, lens, mount)
     information = jacobian.T @ jacobian
     # Radians and metres differ in scale; the condition must not come from that.
     scale = np.sqrt(np.diag(information))

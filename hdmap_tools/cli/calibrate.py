@@ -114,7 +114,7 @@ def extrinsics(**given: Any) -> None:
 
 
 @command.command()
-@click.argument("drive", type=options.PATH)
+@click.argument("drive", type=options.PATH, required=False)
 @click.option("-o", "--out", type=options.PATH, required=True, help="PNG to write.")
 @click.option("--camera", help="Camera [default: the first by name that has images].")
 @click.option(
@@ -124,6 +124,10 @@ def extrinsics(**given: Any) -> None:
     "--calibration",
     type=options.PATH,
     help="Take the camera from this result instead of the drive.",
+)
+@click.option("--image", type=options.PATH, help="Picture, where there is no drive.")
+@click.option(
+    "--points", type=options.PATH, help="Point cloud in the vehicle's frame, for --image."
 )
 @click.option(
     "--max-range-m", type=float, default=60.0, show_default=True, help="Furthest point drawn."
@@ -138,23 +142,38 @@ def check(**given: Any) -> None:
     Examples:
       hdmap calibrate check path/to/drive --camera CAM_FRONT -o check.png
       hdmap calibrate check path/to/drive --calibration mount -o check.png
+      hdmap calibrate check --image a.png --points a.pcd --calibration mount -o check.png
 
     Where the lidar sits higher than the camera it sees over things: points behind them show
     through, which is no error of the calibration.
     """
-    from hdmap_tools.calibration.make import make_check
+    from hdmap_tools.calibration.make import make_check, make_check_of_files
 
-    drawn = make_check(
-        given["drive"],
-        given["out"],
-        name=given["camera"],
-        calibration=given["calibration"],
-        index=given["index"],
-        scene=given["scene"],
-        layout=given["layout"],
-        max_range_m=given["max_range_m"],
-        overwrite=given["overwrite"],
-    )
+    of_files = [given["image"], given["points"]]
+    if given["drive"] is not None and of_files == [None, None]:
+        drawn = make_check(
+            given["drive"],
+            given["out"],
+            name=given["camera"],
+            calibration=given["calibration"],
+            index=given["index"],
+            scene=given["scene"],
+            layout=given["layout"],
+            max_range_m=given["max_range_m"],
+            overwrite=given["overwrite"],
+        )
+    elif given["drive"] is None and None not in (*of_files, given["calibration"]):
+        drawn = make_check_of_files(
+            given["image"],
+            given["points"],
+            given["out"],
+            given["calibration"],
+            name=given["camera"],
+            max_range_m=given["max_range_m"],
+            overwrite=given["overwrite"],
+        )
+    else:
+        raise click.UsageError("Give a DRIVE, or --image, --points and --calibration together.")
     click.echo(
         f"{drawn['camera']}: {drawn['num_drawn']} of {drawn['num_points']} points drawn into "
         f"{drawn['image']} at {given['out']}"

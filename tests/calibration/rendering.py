@@ -39,14 +39,27 @@ class Renderer:
     def image(self, board, cam_SE3_board, rng, blur_px=0.8, noise=2.0):
         """(h, w) uint8: the board on a grey wall, with white paper of one square around it."""
         offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
-        total = np.zeros(self._rays.shape[:2])
+        light = np.full(self._rays.shape[:2], 120.0)
+        part = self._part_with(board, cam_SE3_board)
+        light[part] = 0.0
         for du in offsets:
             for dv in offsets:
-                rays = self._rays + du * self._along_u + dv * self._along_v
-                total += self._shade(board, cam_SE3_board, rays)
-        light = cv2.GaussianBlur(total / _SAMPLES**2, (0, 0), blur_px)
+                rays = self._rays[part] + du * self._along_u[part] + dv * self._along_v[part]
+                light[part] += self._shade(board, cam_SE3_board, rays) / _SAMPLES**2
+        light = cv2.GaussianBlur(light, (0, 0), blur_px)
         light += rng.normal(0.0, noise, light.shape)
         return np.clip(np.round(light), 0, 255).astype(np.uint8)
+
+    def _part_with(self, board, cam_SE3_board):
+        """The pixels around the paper: the wall needs no samples."""
+        columns, rows = np.meshgrid(
+            np.linspace(-2, board.columns + 1, 20), np.linspace(-2, board.rows + 1, 20)
+        )
+        paper = np.column_stack([columns.ravel(), rows.ravel(), np.zeros(400)]) * board.square_m
+        uv = self.camera.project(cam_SE3_board.transform_from(paper)).uv
+        u0, v0 = np.maximum(np.floor(np.nanmin(uv, axis=0)).astype(int) - 6, 0)
+        u1, v1 = np.ceil(np.nanmax(uv, axis=0)).astype(int) + 7
+        return slice(v0, v1), slice(u0, u1)
 
     @staticmethod
     def _shade(board, cam_SE3_board, rays):
