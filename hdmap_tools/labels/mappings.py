@@ -8,7 +8,7 @@ from typing import Final
 
 from hdmap_tools.errors import LabelError
 from hdmap_tools.labels import street
-from hdmap_tools.labels.camvid import CAMVID, CAMVID_TO_PAZ2020
+from hdmap_tools.labels.camvid import CAMVID, CAMVID_32, CAMVID_32_TO_PAZ2020, CAMVID_TO_PAZ2020
 from hdmap_tools.labels.cityscapes import (
     CITYSCAPES,
     CITYSCAPES_IDS,
@@ -32,6 +32,8 @@ _FATES: Final[Mapping[tuple[str, str], Mapping[str, str | None]]] = {
     (CITYSCAPES, STREET): street.CITYSCAPES_TO_STREET,
     (CAMVID, PAZ2020): CAMVID_TO_PAZ2020,
     (CAMVID, STREET): street.CAMVID_TO_STREET,
+    (CAMVID_32, PAZ2020): CAMVID_32_TO_PAZ2020,
+    (CAMVID_32, STREET): street.CAMVID_32_TO_STREET,
     (PAZ2020, STREET): street.PAZ2020_TO_STREET,
 }
 

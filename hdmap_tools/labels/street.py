@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final
 
-from hdmap_tools.labels.camvid import CAMVID_TO_PAZ2020
+from hdmap_tools.labels.camvid import CAMVID_32_TO_PAZ2020, CAMVID_TO_PAZ2020
 from hdmap_tools.labels.cityscapes import CITYSCAPES_IDS_TO_PAZ2020, CITYSCAPES_TO_PAZ2020
 from hdmap_tools.labels.vistas import VISTAS_TO_PAZ2020
 from hdmap_tools.labels.vistas_v2 import VISTAS_V2_TO_PAZ2020
@@ -121,3 +121,15 @@ CITYSCAPES_TO_STREET: Final = _through_paz2020(CITYSCAPES_TO_PAZ2020, _CITYSCAPE
 
 CAMVID_TO_STREET: Final = _through_paz2020(CAMVID_TO_PAZ2020, {})
 """The fate of every label of ``camvid-11``; fences have no place."""
+
+CAMVID_32_TO_STREET: Final = _through_paz2020(
+    CAMVID_32_TO_PAZ2020,
+    {
+        "OtherMoving": "vehicle",
+        "TrafficLight": "pole",
+        "Train": "vehicle",
+        "Truck_Bus": "vehicle",
+        "Tunnel": "building",
+    },
+)
+"""The fate of every label of ``camvid-32``."""

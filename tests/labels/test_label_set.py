@@ -23,6 +23,7 @@ from hdmap_tools.labels.label_set import (
 SHIPPED = (
     "adas-0001",
     "camvid-11",
+    "camvid-32",
     "cityscapes",
     "cityscapes-ids",
     "mapillary-vistas-124",

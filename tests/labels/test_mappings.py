@@ -11,6 +11,7 @@ from hdmap_tools.labels.label_set import IGNORE_ID, Label, LabelSet, load_label_
 from hdmap_tools.labels.mappings import known_mappings, mapping_to, shipped_mapping
 
 SOURCES = (
+    "camvid-32",
     "camvid-11",
     "cityscapes",
     "cityscapes-ids",

@@ -135,8 +135,8 @@ class Augment:
         columns = slice(window.left, window.left + window.width)
         size = [window.out_height, window.out_width]
         # A view with the channels last: torchvision resizes such bytes as they are.
-        image: Any = torch.from_numpy(np.ascontiguousarray(rgb[rows, columns])).permute(2, 0, 1)
-        mask: Any = torch.from_numpy(np.ascontiguousarray(ids[rows, columns]))[None]
+        image: Any = torch.from_numpy(rgb[rows, columns].copy()).permute(2, 0, 1)
+        mask: Any = torch.from_numpy(ids[rows, columns].copy())[None]
         image = functional.resize_image(image, size, v2.InterpolationMode.BILINEAR, antialias=True)
         # Torchvision resizes a Mask with NEAREST, up to a source pixel beside where the
         # bilinear image has it; that is the width of a far lane mark.

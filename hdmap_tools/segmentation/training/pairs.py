@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from hdmap_tools.errors import ConfigError
-from hdmap_tools.segmentation.training.camvid_folder import open_camvid
+from hdmap_tools.segmentation.training.camvid_folder import open_camvid, open_camvid_32
 from hdmap_tools.segmentation.training.cityscapes_folder import open_cityscapes
 from hdmap_tools.segmentation.training.drive_pairs import open_drives
 from hdmap_tools.segmentation.training.image_pairs import ImagePairs, joined, relabelled
@@ -15,11 +15,11 @@ from hdmap_tools.segmentation.training.vistas_folder import open_vistas
 
 SPEC_HELP: Final = (
     "drive:FOLDER[:LABELS], vistas:FOLDER[:SPLIT], vistas-v2:FOLDER[:SPLIT], "
-    "cityscapes:FOLDER[:SPLIT] or camvid:FOLDER[:SPLIT]; FOLDER alone is a drive"
+    "cityscapes:FOLDER[:SPLIT], camvid:FOLDER[:SPLIT] or camvid-32:FOLDER; FOLDER alone is a drive"
 )
 """How data is named on the command line."""
 
-_KINDS: Final = ("drive", "vistas", "vistas-v2", "cityscapes", "camvid")
+_KINDS: Final = ("drive", "vistas", "vistas-v2", "cityscapes", "camvid", "camvid-32")
 
 
 def open_pairs(spec: str) -> ImagePairs:
@@ -30,7 +30,7 @@ def open_pairs(spec: str) -> ImagePairs:
             ``drive:FOLDER:LABELS``, with its label images elsewhere;
             ``vistas:FOLDER:SPLIT``, ``vistas-v2:FOLDER:SPLIT``,
             ``cityscapes:FOLDER:SPLIT``, ``camvid:FOLDER:SPLIT``, the split being the one
-            for training when it is left out; or a folder alone, which is a drive.
+            for training when it is left out; ``camvid-32:FOLDER``, which has no splits; or a folder alone, which is a drive.
 
     Raises:
         ConfigError: If the kind of data is unknown, or a folder is missing or empty.
@@ -46,7 +46,7 @@ def open_pairs(spec: str) -> ImagePairs:
     if not rest:
         raise ConfigError(f"{spec!r} names no folder; expected {SPEC_HELP}.")
     folder, _, second = rest.rpartition(":")
-    if not folder or Path(rest).exists():
+    if not folder or kind == "camvid-32" or Path(rest).exists():
         folder, second = rest, ""
     match kind:
         case "vistas":
@@ -57,6 +57,8 @@ def open_pairs(spec: str) -> ImagePairs:
             return open_cityscapes(folder, second or "train")
         case "camvid":
             return open_camvid(folder, second or "train")
+        case "camvid-32":
+            return open_camvid_32(folder)
         case _:
             return open_drives([folder], second or None)
 
@@ -67,6 +69,7 @@ __all__ = [
     "LabelledFiles",
     "joined",
     "open_camvid",
+    "open_camvid_32",
     "open_cityscapes",
     "open_drives",
     "open_pairs",

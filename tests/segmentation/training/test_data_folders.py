@@ -161,6 +161,29 @@ def test_camvid_void_is_not_judged(camvid: Path) -> None:
         open_camvid(camvid, "val")
 
 
+def test_camvid_in_colours(tmp_path: Path) -> None:
+    label_set = load_label_set("camvid-32")
+    ids = ids_up_to(32)
+    write_image(tmp_path / "701_StillsRaw_full" / "0001TP_1.png")
+    label = tmp_path / "LabeledApproved_full" / "0001TP_1_L.png"
+    label.parent.mkdir()
+    colours = label_set.colors[ids]
+    cv2.imwrite(str(label), np.ascontiguousarray(colours[..., ::-1]))
+    expected = np.where(ids == label_set.id_of("Void"), IGNORE_ID, ids)
+    check(open_pairs(f"camvid-32:{tmp_path}"), "camvid-32", expected)
+    street = relabelled(open_pairs(f"camvid-32:{tmp_path}"), "street").read(0)[1]
+    paint = np.isin(ids, [label_set.id_of(n) for n in ("LaneMkgsDriv", "LaneMkgsNonDriv")])
+    np.testing.assert_array_equal(street == load_label_set("street").id_of("lane marking"), paint)
+    for wrong in ((128, 64, 130), (0, 64, 0)):
+        colours[3, 4] = wrong
+        cv2.imwrite(str(label), np.ascontiguousarray(colours[..., ::-1]))
+        with pytest.raises(
+            LabelError,
+            match=rf"_L\.png has the colour \({wrong[0]}, {wrong[1]}, {wrong[2]}\) \(1 pixels",
+        ):
+            open_pairs(f"camvid-32:{tmp_path}").read(0)
+
+
 Damage = Callable[[Path, Path], None]
 
 
