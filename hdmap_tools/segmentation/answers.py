@@ -7,11 +7,13 @@ taking the best first and enlarging ids (road 0.8687 and 0.8682).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from hdmap_tools.errors import LabelError
 from hdmap_tools.labels.label_set import LabelSet
-from hdmap_tools.types import NDArrayAny, NDArrayByte
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat32
 
 
 def labels_from_scores(
@@ -31,6 +33,28 @@ def labels_from_scores(
     """
     import cv2
 
+    planes = _checked_scores(scores, label_set, about)
+    return _best((_resized(plane, size_px, cv2.INTER_LINEAR) for plane in planes), size_px)
+
+
+def enlarged_scores(
+    scores: NDArrayAny, label_set: LabelSet, size_px: tuple[int, int], about: str
+) -> NDArrayFloat32:
+    """The scores (C, height, width) float32 themselves, at that size; arguments as above."""
+    import cv2
+
+    planes = _checked_scores(scores, label_set, about)
+    if planes.shape[1:] == (size_px[1], size_px[0]):
+        return planes
+    return np.stack([_resized(plane, size_px, cv2.INTER_LINEAR) for plane in planes])
+
+
+def best_labels(scores: NDArrayFloat32) -> NDArrayByte:
+    """The best-scored label (h, w) uint8 of scores (C, h, w); the lower id where two are equal."""
+    return _best(iter(np.ascontiguousarray(scores)), (scores.shape[2], scores.shape[1]))
+
+
+def _checked_scores(scores: NDArrayAny, label_set: LabelSet, about: str) -> NDArrayFloat32:
     if scores.ndim != 4 or scores.shape[0] != 1:
         raise LabelError(f"{about} gave shape {scores.shape}; scores must be (1, C, H, W).")
     if scores.shape[1] != len(label_set):
@@ -39,22 +63,24 @@ def labels_from_scores(
             f"{len(label_set)} labels ({', '.join(label_set.names)}); name the label set that the "
             "network was trained with in its profile."
         )
-    scores = np.ascontiguousarray(scores[0], dtype=np.float32)
-    if not np.isfinite(scores).all():
+    planes = np.ascontiguousarray(scores[0], dtype=np.float32)
+    if not np.isfinite(planes).all():
         raise LabelError(
-            f"{about} gave {int((~np.isfinite(scores)).sum())} scores that are NaN or infinite; the "
+            f"{about} gave {int((~np.isfinite(planes)).sum())} scores that are NaN or infinite; the "
             "model file is damaged, or its profile feeds it numbers of the wrong range."
         )
-    width, height = size_px
-    ids: NDArrayByte = np.zeros((height, width), dtype=np.uint8)
-    best = _resized(scores[0], size_px, cv2.INTER_LINEAR)
-    if np.shares_memory(best, scores):
-        best = best.copy()  # the planes of a whole answer stay as they are
+    return planes
+
+
+def _best(planes: Iterator[NDArrayFloat32], size_px: tuple[int, int]) -> NDArrayByte:
+    import cv2
+
+    best = next(planes).copy()  # the planes of a whole answer stay as they are
+    ids: NDArrayByte = np.zeros((size_px[1], size_px[0]), dtype=np.uint8)
     is_better = np.empty_like(ids)
     # A plane at a time, and by OpenCV's vector instructions: a masked copy in numpy took
     # ten times as long. Ids only grow, so the larger of the old and the new one is right.
-    for label_id in range(1, len(scores)):
-        score = _resized(scores[label_id], size_px, cv2.INTER_LINEAR)
+    for label_id, score in enumerate(planes, start=1):
         cv2.compare(score, best, cv2.CMP_GT, dst=is_better)
         cv2.max(score, best, dst=best)
         np.minimum(is_better, np.uint8(label_id), out=is_better)

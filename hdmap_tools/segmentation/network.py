@@ -1,16 +1,11 @@
-"""What all networks share: images into the numbers they want, one by one, in batches or in tiles.
-
-Images are shrunk bilinearly, as the networks' own preprocessing does; on five annotated
-street images averaging over the area instead gave marks an IoU of 0.595 against 0.587,
-but road 0.864 against 0.869.
-"""
+"""What all networks share: images fed one by one, in batches or in tiles, and label images back."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -22,11 +17,17 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.labels.label_set import LabelSet, load_label_set
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.readers.image import read_image
-from hdmap_tools.segmentation.answers import labels_from_ids, labels_from_scores
+from hdmap_tools.segmentation.answers import (
+    best_labels,
+    enlarged_scores,
+    labels_from_ids,
+    labels_from_scores,
+)
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
+from hdmap_tools.segmentation.inputs import fed_size, input_of, neutral_colour
 from hdmap_tools.segmentation.network_checks import check_input, check_output
 from hdmap_tools.segmentation.segmenter import ModelProfile
-from hdmap_tools.segmentation.tiling import Tiling, padded
+from hdmap_tools.segmentation.tiling import Span, Tiling, blended
 from hdmap_tools.segmentation.undistortion import Rectification
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat32
 
@@ -206,31 +207,70 @@ class NetworkSegmenter:
                 )
         tiling = self.handling.tiling
         if tiling is None:
-            return self._run(rgbs, whats, self.profile.input_size_px)
+            return self._whole(rgbs, whats)
         return [self._tiled(rgb, what, tiling) for rgb, what in zip(rgbs, whats, strict=True)]
 
+    def _whole(self, rgbs: Sequence[NDArrayByte], whats: Sequence[str]) -> list[NDArrayByte]:
+        size_px = self.profile.input_size_px
+        to_labels = labels_from_scores if self.profile.output == "scores" else labels_from_ids
+        results = []
+        answers = self._answers(rgbs, whats, size_px)
+        for rgb, (answer, about) in zip(rgbs, answers, strict=True):
+            height, width = rgb.shape[:2]
+            fed = (width, height) if size_px else fed_size((width, height), self.profile)
+            labels = to_labels(answer, self._label_set, fed, about)
+            results.append(np.ascontiguousarray(labels[:height, :width]))
+        return results
+
     def _tiled(self, rgb: NDArrayByte, what: str, tiling: Tiling) -> NDArrayByte:
-        height, width = rgb.shape[:2]
-        tiles = list(tiling.tiles(width, height))
-        labels: NDArrayByte = np.empty((height, width), dtype=np.uint8)
-        for start in range(0, len(tiles), self.batch):
-            some = tiles[start : start + self.batch]
-            cut = [tiling.cut(rgb, tile) for tile in some]
-            for tile, found in zip(some, self._run(cut, [what] * len(some), None), strict=True):
-                (left, right), (top, bottom) = tile.keep_x, tile.keep_y
+        columns, rows = tiling.columns(rgb.shape[1]), tiling.rows(rgb.shape[0])
+        if self.profile.output == "scores":
+            strips = (self._strip(rgb, what, tiling, columns, row) for row in rows)
+            return np.concatenate(list(blended(strips, rows, best_labels)))
+        labels: NDArrayByte = np.empty(rgb.shape[:2], dtype=np.uint8)
+        fed = fed_size(tiling.size_px, self.profile)
+        for row in rows:
+            cut = [tiling.cut(rgb, column, row) for column in columns]
+            answers = self._answers(cut, [what] * len(cut), None)
+            for column, (answer, about) in zip(columns, answers, strict=True):
+                found = labels_from_ids(answer, self._label_set, fed, about)
+                (left, right), (top, bottom) = column.own, row.own
                 labels[top:bottom, left:right] = found[
-                    top - tile.y : bottom - tile.y, left - tile.x : right - tile.x
+                    top - row.start : bottom - row.start, left - column.start : right - column.start
                 ]
         return labels
 
-    def _run(
+    def _strip(
+        self, rgb: NDArrayByte, what: str, tiling: Tiling, columns: Sequence[Span], row: Span
+    ) -> NDArrayFloat32:
+        """(C, end - begin, width) scores of a row of tiles, blended from left to right."""
+        shape = (len(self._label_set), row.end - row.begin, rgb.shape[1])
+        strip = np.zeros(shape, dtype=np.float32)
+        fed = fed_size(tiling.size_px, self.profile)
+        cut = [tiling.cut(rgb, column, row) for column in columns]
+        answers = self._answers(cut, [what] * len(cut), None)
+        for column, (answer, about) in zip(columns, answers, strict=True):
+            scores = enlarged_scores(answer, self._label_set, fed, about)
+            strip[:, :, column.begin : column.end] += (
+                column.weights
+                * scores[
+                    :,
+                    row.begin - row.start : row.end - row.start,
+                    column.begin - column.start : column.end - column.start,
+                ]
+            )
+        return strip
+
+    def _answers(
         self,
         rgbs: Sequence[NDArrayByte],
         whats: Sequence[str],
         input_size_px: tuple[int, int] | None,
-    ) -> list[NDArrayByte]:
-        """Label images of images, fed at a size or (None) at their own, the same ones together."""
-        results: list[NDArrayByte] = []
+    ) -> Iterator[tuple[NDArrayAny, str]]:
+        """The answer (1, ...) to each image, fed at a size or (None) its own, and what to call it.
+
+        As many images of one size as a batch takes are fed together.
+        """
         start = 0
         while start < len(rgbs):
             end = start + 1
@@ -239,35 +279,18 @@ class NetworkSegmenter:
             ):
                 end += 1
             some = rgbs[start:end]
-            batch = np.concatenate([_input_of(rgb, self.profile, input_size_px) for rgb in some])
-            answer = self.network.run(batch)
-            about = (
-                f"Network {self.name} ({self.network.path}), run on {', '.join(whats[start:end])},"
-            )
-            if answer.ndim == 0 or len(answer) != len(some):
+            batch = [input_of(rgb, self.profile, input_size_px) for rgb in some]
+            answer = self.network.run(batch[0] if len(batch) == 1 else np.concatenate(batch))
+            ran_on = ", ".join(dict.fromkeys(whats[start:end]))
+            about = f"Network {self.name} ({self.network.path}), run on {ran_on},"
+            if len(some) > 1 and (answer.ndim == 0 or len(answer) != len(some)):
                 raise LabelError(
                     f"{about} gave shape {answer.shape} for {len(some)} images; expected an answer "
                     "an image, along the first axis."
                 )
-            for index, rgb in enumerate(some):
-                results.append(self._labels(answer[index : index + 1], rgb, input_size_px, about))
+            for index in range(len(some)):
+                yield (answer if len(some) == 1 else answer[index : index + 1]), about
             start = end
-        return results
-
-    def _labels(
-        self,
-        answer: NDArrayAny,
-        rgb: NDArrayByte,
-        input_size_px: tuple[int, int] | None,
-        about: str,
-    ) -> NDArrayByte:
-        height, width = rgb.shape[:2]
-        to_labels = labels_from_scores if self.profile.output == "scores" else labels_from_ids
-        if input_size_px is not None:
-            return to_labels(answer, self._label_set, (width, height), about)
-        fed = _fed_size((width, height), self.profile)
-        labels = to_labels(answer, self._label_set, fed, about)
-        return np.ascontiguousarray(labels[:height, :width])
 
 
 def camera_of(image: ImageRef, cameras: Mapping[str, PinholeCamera]) -> PinholeCamera:
@@ -283,43 +306,3 @@ def camera_of(image: ImageRef, cameras: Mapping[str, PinholeCamera]) -> PinholeC
             f"Image {image.path} is of camera {image.camera!r}, which has no calibration; "
             f"calibrated are {', '.join(sorted(cameras)) or 'none'}."
         ) from error
-
-
-def batch_from_image(rgb: NDArrayByte, profile: ModelProfile) -> NDArrayFloat32:
-    """The network's input (1, 3, H, W) float32 of an image (height, width, 3) uint8 RGB."""
-    return _input_of(rgb, profile, profile.input_size_px)
-
-
-def neutral_colour(profile: ModelProfile) -> tuple[int, int, int]:
-    """The (R, G, B) that is nearest to zeros once normalized, which networks pad with."""
-    values = np.clip(np.round(np.array(profile.mean) / profile.scale), 0, 255).astype(int)
-    first, second, third = values.tolist()
-    return (first, second, third) if profile.channels == "rgb" else (third, second, first)
-
-
-def _fed_size(size_px: tuple[int, int], profile: ModelProfile) -> tuple[int, int]:
-    """(width, height) rounded up to what the network can divide."""
-    multiple = profile.size_multiple_px
-    return -(-size_px[0] // multiple) * multiple, -(-size_px[1] // multiple) * multiple
-
-
-def _input_of(
-    rgb: NDArrayByte, profile: ModelProfile, input_size_px: tuple[int, int] | None
-) -> NDArrayFloat32:
-    import cv2
-
-    if input_size_px is None:
-        rgb = padded(rgb, *_fed_size((rgb.shape[1], rgb.shape[0]), profile))
-    elif input_size_px != (rgb.shape[1], rgb.shape[0]):
-        # OpenCV's linear filter takes pixel centres at halves, so nothing shifts.
-        rgb = cv2.resize(rgb, input_size_px, interpolation=cv2.INTER_LINEAR)  # type: ignore[assignment]
-    planes = cv2.split(rgb)
-    if profile.channels == "bgr":
-        planes = planes[::-1]
-    batch = np.empty((1, 3, *rgb.shape[:2]), dtype=np.float32)
-    for channel, plane in enumerate(planes):
-        target = batch[0, channel]
-        np.multiply(plane, np.float32(profile.scale), out=target)
-        target -= np.float32(profile.mean[channel])
-        target /= np.float32(profile.std[channel])
-    return batch

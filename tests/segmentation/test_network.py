@@ -9,10 +9,10 @@ from hypothesis.extra import numpy as npst
 from hdmap_tools.errors import CalibrationError, ConfigError, LabelError, ShapeError
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.segmentation.answers import labels_from_ids, labels_from_scores
+from hdmap_tools.segmentation.inputs import batch_from_image
 from hdmap_tools.segmentation.network import (
     Network,
     NetworkSegmenter,
-    batch_from_image,
 )
 
 blocks = npst.arrays(np.uint8, st.tuples(st.just(3), st.just(4)), elements=st.integers(0, 3))
