@@ -121,6 +121,7 @@ class StreetNet(nn.Module):  # type: ignore[misc]
         self.scores = nn.Conv2d(half, num_labels * 4, 1)
 
     def forward(self, images: Tensor) -> Tensor:
+        """Logits (N, labels, H, W) of normalized images (N, 3, H, W)."""
         height, width = images.shape[-2:]
         at2 = self.stage1(images)
         at4 = self.stage2(at2)

@@ -127,7 +127,15 @@ PRESETS: Final[dict[str, TrainPreset]] = {
             epochs=20,
             class_weight_power=0.25,
             bfloat16_on_cpu=True,
-            augmentation=Augmentation(crop_px=480, scale=(0.7, 1.6)),
+            augmentation=Augmentation(
+                crop_px=480,
+                scale=(0.7, 1.6),
+                brightness=0.25,
+                contrast=0.25,
+                saturation=0.25,
+                white_balance=0.05,
+                noise=0.02,
+            ),
         ),
     )
 }

@@ -33,8 +33,8 @@ from hdmap_tools.segmentation.training.checkpoint import (
     write_state,
 )
 from hdmap_tools.segmentation.training.class_weights import class_weights
-from hdmap_tools.segmentation.training.models import build_model
 from hdmap_tools.segmentation.training.image_pairs import ImagePairs
+from hdmap_tools.segmentation.training.models import build_model
 from hdmap_tools.segmentation.training.presets import AdamW, Sgd
 from hdmap_tools.segmentation.training.processes import Processes, joined_processes, unwrapped
 from hdmap_tools.segmentation.training.run_settings import RunSettings, read_settings, require_same
@@ -209,10 +209,12 @@ class _Training:
         kind, half, enabled = self.autocast
         with torch.autocast(kind, half, enabled=enabled):
             logits = self.model(images.to(device, non_blocking=True))
+        # Channels first again: the loss takes a quarter less time so.
+        logits = logits.float().contiguous()
         if bool((ids != IGNORE_ID).any()):
-            loss = self.loss(logits.float(), ids.to(device, non_blocking=True))
+            loss = self.loss(logits, ids.to(device, non_blocking=True))
         else:  # the mean over no pixel is NaN, and would be for ever
-            loss = logits.float().sum() * 0
+            loss = logits.sum() * 0
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(loss).backward()
         self.scaler.step(self.optimizer)
