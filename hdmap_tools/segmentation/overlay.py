@@ -58,7 +58,8 @@ def legend_picture(label_set: LabelSet) -> NDArrayByte:
     picture = np.full((_ROW_PX * len(names), 2 * _ROW_PX + widest, 3), 255, dtype=np.uint8)
     for row, (label, name) in enumerate(zip(label_set.labels, names, strict=True)):
         top = row * _ROW_PX
-        picture[top + 3 : top + _ROW_PX - 3, 4 : _ROW_PX + 12] = label.color
+        picture[top + 3 : top + _ROW_PX - 3, 4 : _ROW_PX + 12] = 128  # white is seen, too
+        picture[top + 4 : top + _ROW_PX - 4, 5 : _ROW_PX + 11] = label.color
         corner = (_ROW_PX + 20, top + _ROW_PX - 8)
         cv2.putText(picture, name, corner, font, scale, (0, 0, 0), 1, cv2.LINE_AA)
     return picture

@@ -20,6 +20,8 @@ MAX_MARGIN: Final = 0.25
 """The rectified picture goes beyond the recorded one by so much of its size on each side at
 most: towards the rim of a wide lens it grows without bound, and shows ever less."""
 
+_STEP_PX: Final = 8
+
 
 class Rectification:
     """A distorted camera's way to the picture without distortion, and back.
@@ -36,11 +38,7 @@ class Rectification:
 
     def __init__(self, camera: PinholeCamera) -> None:
         width, height = camera.width_px, camera.height_px
-        u, v = np.meshgrid(np.arange(width), np.arange(height))
-        recorded = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-        # Rays have length one along the optical axis, so their x and y are the pixel's own.
-        xy = (camera.rays_ego(recorded) @ camera.ego_SE3_cam.rotation)[:, :2]
-        uv = xy * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        uv = _rectified_places(camera)
         known = np.asarray(np.isfinite(uv).all(axis=1))
         margin = np.array([width, height]) * MAX_MARGIN
         # Without a pixel that has a direction the picture is as large as recorded, and unknown.
@@ -94,6 +92,33 @@ class Rectification:
         recorded: NDArrayByte = labels.reshape(-1)[self._nearest]
         recorded[self._outside] = IGNORE_ID
         return recorded.reshape(self._shape)
+
+
+def _rectified_places(camera: PinholeCamera) -> NDArrayFloat:
+    """(height * width, 2): where each recorded pixel would be without distortion; NaN: nowhere.
+
+    Solved for every eighth pixel and interpolated, which takes a fiftieth of the time and
+    is off by some hundredths of a pixel.
+    """
+    width, height = camera.width_px, camera.height_px
+    u = np.linspace(0, width - 1, -(-(width - 1) // _STEP_PX) + 1)
+    v = np.linspace(0, height - 1, -(-(height - 1) // _STEP_PX) + 1)
+    coarse = np.stack(np.meshgrid(u, v), axis=-1)
+    # Rays have length one along the optical axis, so their x and y are the pixel's own.
+    xy = camera.rays_ego(coarse.reshape(-1, 2)) @ camera.ego_SE3_cam.rotation
+    places = xy[:, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    fine = _interpolated(places.reshape(coarse.shape), height, 0)
+    return _interpolated(fine, width, 1).reshape(-1, 2)
+
+
+def _interpolated(values: NDArrayFloat, length: int, axis: int) -> NDArrayFloat:
+    """Values on a grid from the first to the last of so many places along an axis, at each of them."""
+    count = values.shape[axis]
+    at = np.linspace(0, count - 1, length)
+    low = np.minimum(at.astype(int), max(count - 2, 0))
+    share = np.expand_dims(at - low, [a for a in range(values.ndim) if a != axis])
+    first = values.take(low, axis)
+    return np.asarray(first + share * (values.take(np.minimum(low + 1, count - 1), axis) - first))
 
 
 def _source_map(recorded: PinholeCamera, rectified: PinholeCamera) -> NDArrayFloat:

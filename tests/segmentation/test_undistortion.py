@@ -14,7 +14,7 @@ from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import IGNORE_ID
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.segmentation.network import Handling, Network, NetworkSegmenter
-from hdmap_tools.segmentation.undistortion import MAX_MARGIN, Rectification
+from hdmap_tools.segmentation.undistortion import MAX_MARGIN, Rectification, _rectified_places
 
 SQUARE_M = 0.08
 LENSES = {
@@ -86,6 +86,15 @@ def test_a_lens_that_sees_very_wide_is_cut_and_the_rest_is_not_judged():
     back = way.to_recorded(np.ones((way.camera.height_px, way.camera.width_px), np.uint8))
     assert back[120, 160] == 1
     assert back[0, 0] == back[-1, -1] == IGNORE_ID
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_places_between_those_solved_are_right(lens):
+    recorded = camera(LENSES[lens])
+    u, v = np.meshgrid(np.arange(320), np.arange(240))
+    rays = recorded.rays_ego(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    exact = (rays @ MOUNT.rotation)[:, :2] * (250.0, 255.0) + (163.2, 115.7)
+    np.testing.assert_allclose(_rectified_places(recorded), exact, atol=0.1)
 
 
 def seeing_straight(recorded, label_set, make_profile, handling=None):
