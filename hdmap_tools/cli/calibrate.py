@@ -24,7 +24,7 @@ def command() -> None:
     """
 
 
-@command.command()
+@command.command(short_help="Focal length and distortion from photos of a chessboard.")
 @click.argument("images", metavar="IMAGES...", type=options.PATH, nargs=-1, required=True)
 @click.option("--board", required=True, metavar="COLSxROWS", help="Inner corners, for example 9x6.")
 @click.option("--square-m", type=float, required=True, help="Side of a square, metres.")
@@ -64,7 +64,7 @@ def intrinsics(ctx: click.Context, /, **given: Any) -> None:
     click.echo(_intrinsics_summary(report, given["out"]))
 
 
-@command.command()
+@command.command(short_help="Where a camera sits, from pairs of lidar points and pixels.")
 @click.argument("pairs", metavar="PAIRS.csv", type=options.PATH)
 @click.option(
     "--camera",
@@ -113,7 +113,7 @@ def extrinsics(**given: Any) -> None:
     click.echo(_extrinsics_summary(report, given["out"]))
 
 
-@command.command()
+@command.command(short_help="Draw the lidar into an image, for the eye.")
 @click.argument("drive", type=options.PATH, required=False)
 @click.option("-o", "--out", type=options.PATH, required=True, help="PNG to write.")
 @click.option("--camera", help="Camera [default: the first by name that has images].")

@@ -84,7 +84,7 @@ def test_the_reported_covariance_is_that_of_the_error():
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "wrong"), [(40, 0.2), (15, 0.2), (100, 0.4), (200, 0.0)])
 def test_the_reported_covariance_is_that_of_the_error_over_many_seeds(count, wrong):
-    check_coverage(count, wrong, num_seeds=500)
+    check_coverage(count, wrong, num_seeds=200)
 
 
 def test_the_estimated_noise_is_that_of_the_pixels():
