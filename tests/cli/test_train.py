@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.cli.main import main
-from hdmap_tools.segmentation.embedded import read_embedded
-from hdmap_tools.segmentation.training.training_log import read_log
+from hdmap_tools.cli.main import main  # noqa: E402
+from hdmap_tools.segmentation.embedded import read_embedded  # noqa: E402
+from hdmap_tools.segmentation.training.training_log import read_log  # noqa: E402
 
 
 @pytest.fixture(autouse=True)

@@ -7,10 +7,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.errors import LabelError
-from hdmap_tools.segmentation.training.augmentation import Augment, Augmentation
-from hdmap_tools.segmentation.training.batches import Batches, indices_of_step
-from hdmap_tools.segmentation.training.class_weights import class_weights
+from hdmap_tools.errors import LabelError  # noqa: E402
+from hdmap_tools.segmentation.training.augmentation import Augment, Augmentation  # noqa: E402
+from hdmap_tools.segmentation.training.batches import Batches, indices_of_step  # noqa: E402
+from hdmap_tools.segmentation.training.class_weights import class_weights  # noqa: E402
 
 AUGMENT = Augment(Augmentation(crop_px=32, scale=(0.8, 1.25), noise=0.05))
 

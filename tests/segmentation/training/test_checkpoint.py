@@ -9,8 +9,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.errors import CheckpointError
-from hdmap_tools.segmentation.training.checkpoint import (
+from hdmap_tools.errors import CheckpointError  # noqa: E402
+from hdmap_tools.segmentation.training.checkpoint import (  # noqa: E402
     CHECKPOINT,
     PREVIOUS,
     read_checkpoint,

@@ -9,13 +9,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.errors import CheckpointError, OutputExistsError
-from hdmap_tools.segmentation.embedded import read_embedded
-from hdmap_tools.segmentation.training.checkpoint import BEST, read_state, write_state
-from hdmap_tools.segmentation.training.export_onnx import export_run, onnx_bytes
-from hdmap_tools.segmentation.training.models import build_model
-from hdmap_tools.segmentation.training.presets import PRESETS
-from hdmap_tools.segmentation.training.trainer import CONFUSION_NAME, train
+from hdmap_tools.errors import CheckpointError, OutputExistsError  # noqa: E402
+from hdmap_tools.segmentation.embedded import read_embedded  # noqa: E402
+from hdmap_tools.segmentation.training.checkpoint import BEST, read_state, write_state  # noqa: E402
+from hdmap_tools.segmentation.training.export_onnx import export_run, onnx_bytes  # noqa: E402
+from hdmap_tools.segmentation.training.models import build_model  # noqa: E402
+from hdmap_tools.segmentation.training.presets import PRESETS  # noqa: E402
+from hdmap_tools.segmentation.training.trainer import CONFUSION_NAME, train  # noqa: E402
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -5,9 +5,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("segmentation_models_pytorch")
 
-from hdmap_tools.errors import ConfigError
-from hdmap_tools.segmentation.training.models import build_model
-from hdmap_tools.segmentation.training.presets import PRESETS
+from hdmap_tools.errors import ConfigError  # noqa: E402
+from hdmap_tools.segmentation.training.models import build_model  # noqa: E402
+from hdmap_tools.segmentation.training.presets import PRESETS  # noqa: E402
 
 
 @pytest.fixture(scope="module")

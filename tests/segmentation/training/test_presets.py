@@ -1,6 +1,7 @@
 """The recipes say what the paper says, and their rates follow the share of the run."""
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -34,8 +35,8 @@ def test_adamw_warms_up_to_its_rate_and_falls_from_there():
     values = [rates.rate(share) for share in shares]
     assert values[20] == pytest.approx(0.01) == max(values)
     assert 0 < values[0] < 0.001
-    assert all(a < b for a, b in zip(values[:20], values[1:21], strict=True))
-    assert all(a > b for a, b in zip(values[20:], values[21:], strict=False))
+    assert all(a < b for a, b in pairwise(values[:21]))
+    assert all(a > b for a, b in pairwise(values[20:]))
     assert values[60] == pytest.approx(0.005)  # half of the way down is half of the rate
     assert math.isfinite(sum(values))
 

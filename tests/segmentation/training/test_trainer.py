@@ -15,18 +15,18 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.errors import CheckpointError, ConfigError, LabelError
-from hdmap_tools.segmentation.confusion import ConfusionMatrix
-from hdmap_tools.segmentation.training.checkpoint import (
+from hdmap_tools.errors import CheckpointError, ConfigError, LabelError  # noqa: E402
+from hdmap_tools.segmentation.confusion import ConfusionMatrix  # noqa: E402
+from hdmap_tools.segmentation.training.checkpoint import (  # noqa: E402
     BEST,
     CHECKPOINT,
     read_checkpoint,
     read_state,
 )
-from hdmap_tools.segmentation.training.presets import AdamW
-from hdmap_tools.segmentation.training.trainer import CONFUSION_NAME, train
-from hdmap_tools.segmentation.training.training_log import read_log
-from hdmap_tools.segmentation.training.validation import mean_iou
+from hdmap_tools.segmentation.training.presets import AdamW  # noqa: E402
+from hdmap_tools.segmentation.training.trainer import CONFUSION_NAME, train  # noqa: E402
+from hdmap_tools.segmentation.training.training_log import read_log  # noqa: E402
+from hdmap_tools.segmentation.training.validation import mean_iou  # noqa: E402
 
 HERE = Path(__file__).parent
 
@@ -80,7 +80,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_others(
     assert not same(a, c)
 
 
-class _Stop(Exception):
+class _StopError(Exception):
     pass
 
 
@@ -89,7 +89,7 @@ def stop_after(number):
 
     def stepped(_):
         if next(count) == number:
-            raise _Stop
+            raise _StopError
 
     return stepped
 
@@ -100,7 +100,7 @@ def test_going_on_ends_where_an_uninterrupted_run_ends(
 ):
     settings = toy_run_settings(epochs=6)
     train(tmp_path / "whole", toy_pairs(8), toy_pairs(2, 50), settings)
-    with pytest.raises(_Stop):
+    with pytest.raises(_StopError):
         train(
             tmp_path / "cut",
             toy_pairs(8),

@@ -5,10 +5,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from hdmap_tools.errors import ConfigError, LabelError
-from hdmap_tools.segmentation.confusion import ConfusionMatrix
-from hdmap_tools.segmentation.training.augmentation import Augmentation
-from hdmap_tools.segmentation.training.validation import confusion_on, label_ious, mean_iou
+from hdmap_tools.errors import ConfigError, LabelError  # noqa: E402
+from hdmap_tools.segmentation.confusion import ConfusionMatrix  # noqa: E402
+from hdmap_tools.segmentation.training.augmentation import Augmentation  # noqa: E402
+from hdmap_tools.segmentation.training.validation import confusion_on, label_ious, mean_iou  # noqa: E402
 
 CPU = torch.device("cpu")
 
