@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+TRAIN  := $(VENV)/.train
 PYTEST := $(BIN)/python -m pytest
 ARGS   ?=
 DEMO   ?= demo
@@ -15,7 +16,7 @@ unexport PYTHONPATH
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help venv demo test test-slow test-all lint lint-format lint-rules lint-types format bench schemas clean
+.PHONY: help venv demo test test-slow test-train test-all lint lint-format lint-rules lint-types format bench schemas clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -52,6 +53,14 @@ test: $(READY) ## Run all tests but the slow ones
 
 test-slow: $(READY) ## Run the slow tests only
 	$(PYTEST) -m slow $(ARGS)
+
+test-train: $(TRAIN) ## Install torch (5 GB more) and run the tests of training, the slow ones too
+	$(PYTEST) -m 'slow or not slow' tests/segmentation/training tests/cli/test_train.py $(ARGS)
+
+# The core must work without torch, so what tests it runs before this.
+$(TRAIN): $(READY)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[openvino,lidar,train]'
+	@touch $@
 
 test-all: $(READY) ## Run all tests, the slow ones too
 	$(PYTEST) -m 'not benchmark_suite' $(ARGS)
