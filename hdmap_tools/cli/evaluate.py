@@ -43,15 +43,17 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     \b
     Examples:
       hdmap evaluate demo_town -o evaluated --length-m 300
-      hdmap evaluate map.osm -o evaluated --model road-segmentation-adas-0001.xml
+      hdmap evaluate map.osm -o evaluated --model simulated
       hdmap evaluate drive -o evaluated --calibration other_drive
 
     WORLD is a map to simulate drives in (as for `hdmap simulate`) or a simulated drive; of
-    several the figures over all their cells are printed too. Labels come from --model, by default from the simulated network, whose confusion is
-    measured on other drives than the evaluated one. OUT holds the tables (evaluation.txt,
-    .json, .csv), the measured confusion matrix and pictures.
+    several the figures over all their cells are printed too. Labels come from --model, by
+    default from street-small; `--model simulated` makes errors of a given kind instead. The
+    confusion is measured on other drives than the evaluated one. OUT holds the tables
+    (evaluation.txt, .json, .csv), the measured confusion matrix and pictures.
     """
     from hdmap_tools.evaluate.run import PRESETS, evaluate_all, pooled_text
+    from hdmap_tools.segmentation.shipped import STREET_SMALL
     from hdmap_tools.steps import Steps
 
     preset = PRESETS[given["preset"]]
@@ -59,7 +61,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     if given["resolution"] is None:
         fixed["fusion__resolution_m"] = preset.resolution_m
     if given["model"] is None:
-        fixed["segmentation__model"] = "simulated"
+        fixed["segmentation__model"] = STREET_SMALL
     config = options.resolve_config(given, **fixed)
     settings = settings_of(
         {
