@@ -80,6 +80,7 @@ class TrainPreset(BaseModel):
         optimizer: With its schedule.
         batch: Images a step, over all processes.
         epochs: Times that each training image is seen.
+        max_gradient_norm: Longer gradients are cut to this length; None: never.
         class_weight_power: Labels are weighted in the loss by their frequency to minus
             this power; 0: alike.
         validate_epochs: Validate every so many epochs, and at the end.
@@ -99,6 +100,7 @@ class TrainPreset(BaseModel):
     optimizer: Annotated[Sgd | AdamW, Field(discriminator="name")]
     batch: _Count
     epochs: _Count
+    max_gradient_norm: _Positive | None = None
     class_weight_power: Annotated[float, Field(ge=0, le=1)] = 0.0
     validate_epochs: _Count = 1
     validate_min_steps: _Count = 50
@@ -122,7 +124,10 @@ PRESETS: Final[dict[str, TrainPreset]] = {
         TrainPreset(
             name="small",
             network="street_net",
-            optimizer=AdamW(),
+            # Without a limit to the gradient the loss went to NaN where a slow machine's
+            # warm-up, which goes by time, had few steps.
+            optimizer=AdamW(learning_rate=3e-3),
+            max_gradient_norm=1.0,
             batch=8,
             epochs=20,
             class_weight_power=0.25,

@@ -217,6 +217,10 @@ class _Training:
             loss = logits.sum() * 0
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(loss).backward()
+        longest = self.settings.preset.max_gradient_norm
+        if longest is not None:
+            self.scaler.unscale_(self.optimizer)
+            nn.utils.clip_grad_norm_(self.model.parameters(), longest)
         self.scaler.step(self.optimizer)
         self.scaler.update()
         value = float(loss.detach())
