@@ -43,6 +43,9 @@ from hdmap_tools.segmentation.training.validation import confusion_on, label_iou
 
 _log = logging.getLogger(__name__)
 
+_MAX_SKIPPED: Final = 5
+"""Steps in a row that may be left out; if more are not finite, the weights are lost."""
+
 CONFUSION_NAME: Final = "confusion.json"
 
 Told = Callable[[dict[str, float]], None]
@@ -140,6 +143,7 @@ class _Training:
         # float16 alone underflows; bfloat16 has the range of float32.
         self.scaler = torch.amp.GradScaler(device.type, enabled=half == torch.float16)
         self.step, self.elapsed_s, self.best_miou = 0, 0.0, -math.inf
+        self.num_skipped = 0
 
     def restore(self, state: dict[str, Any]) -> None:
         try:
@@ -206,6 +210,7 @@ class _Training:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.model.train()
+        buffers = [buffer.clone() for buffer in self.model.buffers()]
         kind, half, enabled = self.autocast
         with torch.autocast(kind, half, enabled=enabled):
             logits = self.model(images.to(device, non_blocking=True))
@@ -217,19 +222,36 @@ class _Training:
             loss = logits.sum() * 0
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(loss).backward()
+        self.scaler.unscale_(self.optimizer)
         longest = self.settings.preset.max_gradient_norm
-        if longest is not None:
-            self.scaler.unscale_(self.optimizer)
-            nn.utils.clip_grad_norm_(self.model.parameters(), longest)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), longest or math.inf)
+        value = float(loss.detach())
+        if not self.scaler.is_enabled() and not (math.isfinite(value) and math.isfinite(norm)):
+            self._skip(buffers, value, rate)
+            return math.nan
+        self.num_skipped = 0
         self.scaler.step(self.optimizer)
         self.scaler.update()
-        value = float(loss.detach())
-        if not math.isfinite(value) and not self.scaler.is_enabled():
-            raise ConfigError(
-                f"The loss is {value} at step {self.step}: the learning rate {rate:g} is too high for "
-                "this data; start anew with a lower --learning-rate."
-            )
         return value
+
+    def _skip(self, buffers: list[Tensor], loss: float, rate: float) -> None:
+        """Leave a step out whose loss or gradient is not finite, as mixed precision on GPUs does.
+
+        Kernels of bfloat16 on CPUs gave NaN once in a few hundred steps, for batches that
+        were fine when asked again.
+        """
+        self.num_skipped += 1
+        if self.num_skipped > _MAX_SKIPPED:
+            raise ConfigError(
+                f"The loss is {loss} at step {self.step} and was not finite in the {_MAX_SKIPPED} steps "
+                f"before: the learning rate {rate:g} is too high for this data; start anew with a lower "
+                "--learning-rate."
+            )
+        _log.warning("Step %d left out: its loss or gradient is not finite.", self.step)
+        # The moving means of the normalization have seen it already.
+        for now, before in zip(self.model.buffers(), buffers, strict=True):
+            now.copy_(before)
+        self.optimizer.zero_grad(set_to_none=True)
 
     def _row(self, losses: list[float], rate: float) -> dict[str, float]:
         """What the log says of now; also keeps the weights where they are the best so far."""
