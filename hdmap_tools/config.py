@@ -229,6 +229,8 @@ class FusionConfig(_Step):
             are counted apart, so that a confusion matrix measured by range can be used (`hdmap
             confusion --range-bands`). Each band takes as much memory as all do without.
         reference_height_m: City height that stored heights count from, in whole millimetres.
+        images_per_segment: Images fused between two commits: what a killed build loses at
+            most, and what bounds its memory.
     """
 
     resolution_m: Annotated[float, Field(ge=0.01, le=10)] = 0.1
@@ -236,6 +238,7 @@ class FusionConfig(_Step):
     intensity_threshold: Annotated[int, Field(ge=1, le=255)] | Literal["auto"] = "auto"
     range_edges_m: RangeEdges = ()
     reference_height_m: WholeMillimetres = 0.0
+    images_per_segment: Annotated[int, Field(ge=1)] = 240
 
 
 def _intensity_term(value: Any) -> Any:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -44,9 +43,6 @@ LabelledImages = Iterable[tuple[ImageRef, NDArrayByte]]
 
 _THRESHOLD_WITHOUT_LIDAR = 128
 _IMAGES_FOR_THRESHOLD = 24
-
-IMAGES_PER_SEGMENT: Final = 240
-"""Images fused between two commits; bounds the memory that counts take."""
 
 
 @dataclass
@@ -261,7 +257,7 @@ def fuse(
     commits: Mapping[str, Callable[[CellCounts], object]],
     counts: FrameCounts,
 ) -> None:
-    """Associate and count labelled images, by each method on its own, segment by segment.
+    """Associate and count the labelled images of a segment, by each method on its own.
 
     Args:
         source: Poses and sweeps; its `methods` are used.
@@ -279,9 +275,6 @@ def fuse(
             segment.add(seen, frame_key(image))
             if method == source.methods[0]:
                 counts.observations[image.camera] += len(seen)
-            if segment.num_frames >= IMAGES_PER_SEGMENT:
-                commits[method](segment)
-                segments[method] = CellCounts(meta)
         counts.used += 1
     for method, segment in segments.items():
         if segment.num_frames:
@@ -346,8 +339,12 @@ def build_map(
     cache: LabelCache | None,
     steps: Steps,
     also_in: Path | None = None,
+    resume: bool = False,
 ) -> tuple[dict[str, SemanticMap], FrameCounts]:
     """Segment, associate and fuse a drive into new semantic maps, one for each method.
+
+    Images are fused in segments, each of which is a commit. What a killed build committed
+    is kept with `resume`, and the map in the end is the same.
 
     Args:
         drive: Where images, sweeps and poses come from.
@@ -358,6 +355,8 @@ def build_map(
         steps: Told of progress.
         also_in: Folder for the maps of the methods in `association.also`, by name;
             None leaves them out.
+        resume: Go on with the map at `path`, if there is one: made from the same drive,
+            network and configuration.
 
     Returns:
         Maps by method, the configured one first; and what went in.
@@ -382,24 +381,42 @@ def build_map(
             looked_at[image] = labels
             yield image, labels
 
-    def all_labels() -> LabelledImages:
+    def labels_again(some: tuple[ImageRef, ...], before: int) -> LabelledImages:
         # Labels made for the threshold are not made again; the order of frames does not matter.
-        rest = [image for image in images if image not in looked_at]
-        while looked_at:
-            yield looked_at.popitem()
-        yield from segment_drive(drive, segmenter, rest, cache, steps.segmented)
+        rest = [image for image in some if image not in looked_at]
+        for image in some:
+            if image in looked_at:
+                yield image, looked_at.pop(image)
+        before += len(some) - len(rest)
+
+        def told(number: int, _: int) -> None:
+            if steps.segmented is not None:
+                steps.segmented(before + number, len(images))
+
+        yield from segment_drive(drive, segmenter, rest, cache, told)
 
     with steps.timed("segment and fuse"):
-        threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
-        meta = map_meta(config, drive, segmenter, threshold)
-        maps = {
-            method: SemanticMap.create(
-                path if number == 0 or also_in is None else also_in / method, meta
-            )
-            for number, method in enumerate(source.methods)
-        }
-        commits = {method: partial(_commit, made, drive.id) for method, made in maps.items()}
-        fuse(source, all_labels(), meta, commits, counts)
+        maps: dict[str, SemanticMap] = {}
+        if resume and path.exists():
+            maps = {source.methods[0]: SemanticMap.open(path)}
+            meta = maps[source.methods[0]].meta
+        else:
+            threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
+            meta = map_meta(config, drive, segmenter, threshold)
+            for number, method in enumerate(source.methods):
+                made = path if number == 0 or also_in is None else also_in / method
+                maps[method] = SemanticMap.create(made, meta)
+        done = maps[source.methods[0]].segments_of(drive.id)
+        if done:
+            _LOG.info("Going on after %d segments that are in the map already.", len(done))
+        size = config.fusion.images_per_segment
+        for number in range(-(-len(images) // size)):
+            some = images[number * size : (number + 1) * size]
+            if number in done:
+                counts.used += len(some)
+                continue
+            commits = {m: partial(_commit, made, drive.id, number) for m, made in maps.items()}
+            fuse(source, labels_again(some, number * size), meta, commits, counts)
     silent = sorted({i.camera for i in images} - {c for c, n in counts.observations.items() if n})
     if not maps[source.methods[0]].tile_indices():
         raise DriveError(
@@ -415,5 +432,5 @@ def build_map(
     return maps, counts
 
 
-def _commit(semantic_map: SemanticMap, drive_id: str, counts: CellCounts) -> None:
-    semantic_map.add(counts, drive_id)
+def _commit(semantic_map: SemanticMap, drive_id: str, segment: int, counts: CellCounts) -> None:
+    semantic_map.add(counts, drive_id, f"Add {drive_id}, segment {segment}", segment=segment)

@@ -109,7 +109,7 @@ def replaced_when_done(
     try:
         yield temporary
         require_free(path, overwrite, is_ours)  # someone may have been quicker
-        _put_in_place(temporary, path, parent / "replaced")
+        put_in_place(temporary, path, parent / "replaced")
     except OSError as error:
         if isinstance(error, (StoreError, OutputExistsError)):
             raise
@@ -124,7 +124,7 @@ def replaced_when_done(
                 folder.rmdir()
 
 
-def _put_in_place(made: Path, path: Path, aside: Path) -> None:
+def put_in_place(made: Path, path: Path, aside: Path) -> None:
     """Rename a folder to its place; what was there comes back if that fails."""
     had_older = path.exists()
     if had_older:

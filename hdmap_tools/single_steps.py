@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import hdmap_tools
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.config import Config
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import build_map, map_meta
 from hdmap_tools.opening import open_configured, open_for
-from hdmap_tools.output_folder import map_folder
+from hdmap_tools.output_folder import map_folder, require_free
 from hdmap_tools.point_map.for_drive import with_points
+from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
+from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
+from hdmap_tools.unfinished import resumable_folder
 from hdmap_tools.vectorization import VectorizationResult, choose, vectorize
 from hdmap_tools.view.agreement import agreement_picture
 
@@ -36,9 +41,12 @@ def build_alone(
     like: Path | None = None,
     cache: LabelCache | None = None,
     overwrite: bool = False,
+    resume: bool = True,
     steps: Steps | None = None,
 ) -> dict[str, Any]:
     """`build_map` into a place of its own: a new map that is whole or not there.
+
+    A build that was killed or failed goes on after its last commit when it is asked for again.
 
     Args:
         drive_path: Folder of the drive.
@@ -48,34 +56,57 @@ def build_alone(
             height are taken over, so that both can be merged.
         cache: Where label images are kept between runs.
         overwrite: Replace an earlier map.
+        resume: Go on with an unfinished build of the same; off, it is thrown away.
         steps: Told of progress.
 
     Returns:
         Drive, images used and dropped, tiles, seconds by step.
     """
     steps = steps or Steps()
-    with map_folder(out, overwrite) as folder:
-        with steps.timed("open"):
-            drive = open_for(config, drive_path)
-            segmenter = open_segmenter(config.segmentation, drive)
-            if like is not None:
-                model = SemanticMap.open(like).meta
-                config = settings_of(config, model)
-                threshold = model.intensity_threshold
-                map_meta(config, drive, segmenter, threshold).require_compatible(model)
+    require_free(out, overwrite, is_semantic_map)
+    with steps.timed("open"):
+        drive = open_for(config, drive_path)
+        segmenter = open_segmenter(config.segmentation, drive)
+        if like is not None:
+            model = SemanticMap.open(like).meta
+            config = settings_of(config, model)
+            threshold = model.intensity_threshold
+            map_meta(config, drive, segmenter, threshold).require_compatible(model)
+    plan = _plan(drive, segmenter, config)
+    with resumable_folder(
+        out, plan, overwrite=overwrite, is_ours=is_semantic_map, resume=resume
+    ) as work:
         with steps.timed("points"):
-            config, drive = with_points(config, drive, folder.parent / "scratch")
-        maps, counts = build_map(drive, segmenter, folder, config, cache, steps)
+            config, drive = with_points(config, drive, work / "scratch")
+        maps, counts = build_map(
+            drive, segmenter, work / out.name, config, cache, steps, resume=True
+        )
         made = maps[config.association.method]
-        return {
+        report = {
             "drive": drive.id,
             "model": segmenter.name,
             "intensity_threshold": made.meta.intensity_threshold,
             "num_images": counts.used,
             "num_images_dropped": dict(counts.dropped),
             "num_tiles": len(made.tile_indices()),
-            "seconds": {name: round(value, 3) for name, value in steps.seconds.items()},
         }
+    return report | {
+        "seconds": {name: round(value, 3) for name, value in steps.seconds.items()},
+    }
+
+
+def _plan(drive: Drive, segmenter: Segmenter, config: Config) -> dict[str, Any]:
+    """What a map follows from: a build by another plan is another build."""
+    images = hashlib.sha256("\n".join(image.key for image in drive.images).encode())
+    return {
+        "drive": drive.id,
+        "images": images.hexdigest(),
+        "network": segmenter.fingerprint,
+        "configuration": config.model_dump(
+            mode="json", include={"drive", "points", "association", "fusion"}
+        ),
+        "release": hdmap_tools.__version__,
+    }
 
 
 def settings_of(config: Config, meta: MapMeta) -> Config:

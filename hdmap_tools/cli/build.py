@@ -20,6 +20,12 @@ from hdmap_tools.cli import options
 @options.association_option
 @options.resolution_option
 @options.origin_option
+@click.option(
+    "--resume/--no-resume",
+    default=True,
+    show_default=True,
+    help="Go on with a build that was killed, or throw it away.",
+)
 @options.overwrite_option
 @options.json_option
 @options.config_options
@@ -32,7 +38,8 @@ def command(ctx: click.Context, /, **given: Any) -> None:
       hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
       hdmap build path/to/next_drive -o map2 --like map
 
-    The map is a versioned repository of counts; read it with `hdmap vectorize`,
+    A build that was killed goes on after its last commit when the same command is given
+    again, and ends with the same map. The map is a versioned repository of counts; read it with `hdmap vectorize`,
     `hdmap compare` and `hdmap info`, add maps with `hdmap merge`.
     """
     from hdmap_tools.single_steps import build_alone
@@ -47,6 +54,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             like=given["like"],
             cache=options.label_cache(given["cache_folder"], given["no_cache"]),
             overwrite=given["overwrite"],
+            resume=given["resume"],
             steps=Steps(segmented),
         )
     options.write_json(given["json_path"], report, overwrite=given["overwrite"])

@@ -17,7 +17,6 @@ from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.fusion.voting import CountMode
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.mapping import (
-    IMAGES_PER_SEGMENT,
     FrameCounts,
     FrameSource,
     GroundedSweeps,
@@ -119,7 +118,7 @@ def fuse_variants(
         segment_drive(drive, segmenter, images, cache, steps.segmented)
     ):
         _count_image(image, labels, base, sources, variants, segments, config)
-        if (number + 1) % IMAGES_PER_SEGMENT == 0 or number + 1 == len(images):
+        if (number + 1) % config.fusion.images_per_segment == 0 or number + 1 == len(images):
             for name, segment in segments.items():
                 maps[name].add(segment, drive.id)
             segments = {name: CellCounts(meta) for name, meta in metas.items()}

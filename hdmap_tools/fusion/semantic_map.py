@@ -203,8 +203,24 @@ class SemanticMap:
         counts.num_frames = sum(drive["num_frames"] for drive in self.drives.values())
         return counts
 
-    def add(self, counts: CellCounts, drive_id: str, message: str = "") -> str:
+    def segments_of(self, drive_id: str) -> frozenset[int]:
+        """Numbers of the parts of a drive that were added with one."""
+        return frozenset(
+            version.metadata["segment"]
+            for version in self.history()
+            if "segment" in version.metadata and drive_id in version.metadata.get("drives", {})
+        )
+
+    def add(
+        self, counts: CellCounts, drive_id: str, message: str = "", *, segment: int | None = None
+    ) -> str:
         """Add the counts of (part of) a drive and commit; returns the version's id.
+
+        Args:
+            counts: What was seen.
+            drive_id: Where.
+            message: What to call it in the history.
+            segment: Number of the part, so that `segments_of` knows what is in the map.
 
         Raises:
             MapMismatchError: If the counts are of another kind of map, or overflow.
@@ -214,7 +230,8 @@ class SemanticMap:
         drives = {drive_id: {"num_frames": counts.num_frames}}
         tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
         shift = self._shift_mm(counts.meta)
-        return self._apply(tiles, shift, 1, message or f"Add {drive_id}", lambda _: drives)
+        part = {} if segment is None else {"segment": segment}
+        return self._apply(tiles, shift, 1, message or f"Add {drive_id}", lambda _: drives, part)
 
     def merge(self, other: SemanticMap, name: str = "") -> str:
         """Add all that another map holds, tile by tile.
@@ -292,6 +309,7 @@ class SemanticMap:
         sign: int,
         message: str,
         checked_drives: Callable[[Drives], Drives],
+        more: dict[str, Any] | None = None,
     ) -> str:
         """Add (sign 1) or subtract tiles and commit; the drives are checked in the same session."""
         import zarr
@@ -317,7 +335,9 @@ class SemanticMap:
                     group.attrs["num_tiles"] = len(_listed(session))
                 if not session.has_uncommitted_changes:
                     return session.snapshot_id
-                return session.commit(message, metadata={"drives": drives, "sign": sign})
+                return session.commit(
+                    message, metadata={"drives": drives, "sign": sign} | (more or {})
+                )
             except HDMapError:
                 session.discard_changes()
                 raise

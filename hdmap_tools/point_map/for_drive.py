@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,8 @@ def with_points(
     Args:
         config: As asked for; unchanged where no method needs points and none were given.
         drive: The drive to be mapped.
-        scratch: Folder for a point map that must be made first; need not exist.
+        scratch: Folder for a point map that must be made first; need not exist. One that
+            was made there before is taken.
         progress: Told of sweeps, if one is made.
 
     Raises:
@@ -43,20 +45,24 @@ def with_points(
             "give it with --points.",
             drive.root,
         )
-        path = scratch / "points"
-        path.mkdir(parents=True)
-        point_map = build_point_map(
-            [posed for posed, _ in posed_drives([drive], config, progress)],
-            path,
-            config.points,
-            max_pose_gap_s=config.drive.max_pose_gap_s,
-            progress=progress,
+        path = _whole(
+            scratch / "points",
+            lambda folder: build_point_map(
+                [posed for posed, _ in posed_drives([drive], config, progress)],
+                folder,
+                config.points,
+                max_pose_gap_s=config.drive.max_pose_gap_s,
+                progress=progress,
+            ),
         )
+        point_map = PointMap.open(path)
     elif is_point_file(path):
-        made = scratch / "points"
-        made.mkdir(parents=True)
-        point_map = build_from_file(path, made, config.points, drive.frame)
-        path = made
+        cloud = path
+        path = _whole(
+            scratch / "points",
+            lambda folder: build_from_file(cloud, folder, config.points, drive.frame),
+        )
+        point_map = PointMap.open(path)
     else:
         point_map = PointMap.open(path)
     frame = point_map.meta.frame
@@ -77,6 +83,17 @@ def with_points(
         )
     association = association.model_copy(update={"points": path})
     return config.model_copy(update={"association": association}), drive
+
+
+def _whole(path: Path, make: Callable[[Path], object]) -> Path:
+    """A folder that is made under another name and renamed: whole where it is there."""
+    if not path.is_dir():
+        partial = path.with_name(f"{path.name}.partial")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        make(partial)
+        partial.rename(path)
+    return path
 
 
 def posed_drives(

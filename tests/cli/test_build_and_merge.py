@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from hdmap_tools import mapping
 from hdmap_tools.fusion.semantic_map import SemanticMap
 
 from .conftest import LABELS
@@ -56,10 +55,10 @@ def test_a_map_like_one_with_other_labels(street, hdmap, fails):
     fails(*BUILD, "x", "--like", "adas", *city, says=("label_set",))
 
 
-def test_many_segments_give_the_map_of_one(street, hdmap, monkeypatch):
+def test_many_segments_give_the_map_of_one(street, hdmap):
     assert hdmap("run", "drive", "-o", "one", *LABELS)[0] == 0
-    monkeypatch.setattr(mapping, "IMAGES_PER_SEGMENT", 1)
-    assert hdmap("run", "drive", "-o", "many", *LABELS)[0] == 0
+    one_each = ("--set", "fusion.images_per_segment=1")
+    assert hdmap("run", "drive", "-o", "many", *LABELS, *one_each)[0] == 0
     one, many = (SemanticMap.open(street / n / "semantic_map") for n in ("one", "many"))
     assert len(many.history()) == len(one.history()) + 2
     assert many.read().equals(one.read())
