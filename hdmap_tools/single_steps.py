@@ -176,15 +176,23 @@ def compare_alone(
 
 
 def merge_maps(
-    maps: Sequence[Path], subtract: Sequence[Path], out: Path, *, overwrite: bool = False
+    maps: Sequence[Path],
+    subtract: Sequence[Path],
+    out: Path,
+    *,
+    allow_repeats: bool = False,
+    overwrite: bool = False,
 ) -> SemanticMap:
-    """Add maps into a new one, and take others out of the sum."""
+    """Add maps into a new one, and take others out of the sum.
+
+    A drive that two of them hold is refused, unless repeats are allowed.
+    """
     opened = [SemanticMap.open(path) for path in maps]
     taken = [SemanticMap.open(path) for path in subtract]
     with map_folder(out, overwrite) as folder:
         merged = SemanticMap.create(folder, opened[0].meta)
         for path, one in zip(maps, opened, strict=True):
-            merged.merge(one, str(path))
+            merged.merge(one, str(path), allow_repeats=allow_repeats)
         for path, one in zip(subtract, taken, strict=True):
             merged.subtract(one, str(path))
     return SemanticMap.open(out)

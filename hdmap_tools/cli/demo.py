@@ -39,19 +39,21 @@ def command(ctx: click.Context, /, out: Path, length_m: float, seed: int, overwr
       hdmap demo -o demo --length-m 100
 
     Writes OUT/drive (images, sweeps, poses, truth) and OUT/map (what `hdmap run` writes);
-    labels come from the network that ships, street-small.
+    labels come from the network that ships, or else from true ones with errors.
     """
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
     from hdmap_tools.cli.run import summary
     from hdmap_tools.config import load_config
     from hdmap_tools.output_folder import is_result_of, require_free
     from hdmap_tools.pipeline import run
-    from hdmap_tools.segmentation.shipped import STREET_SMALL
+    from hdmap_tools.segmentation.shipped import network_for_simulated_drives
     from hdmap_tools.simulate.drive import simulate_drive
     from hdmap_tools.steps import Steps
 
     settings = settings_of({"length_m": length_m, "seed": seed})
-    config = load_config(None, {"segmentation.model": STREET_SMALL, "association.method": "dense"})
+    config = load_config(
+        None, {"segmentation.model": network_for_simulated_drives(), "association.method": "dense"}
+    )
     # Two results in one folder: the map's hdmap.yaml names the drive by its final place.
     for name, made_by in ((DRIVE, "simulate"), (MAP, "run")):
         require_free(out / name, overwrite, is_result_of(made_by))

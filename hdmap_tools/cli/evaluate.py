@@ -48,12 +48,12 @@ def command(ctx: click.Context, /, **given: Any) -> None:
 
     WORLD is a map to simulate drives in (as for `hdmap simulate`) or a simulated drive; of
     several the figures over all their cells are printed too. Labels come from --model, by
-    default from street-small; `--model simulated` makes errors of a given kind instead. The
+    default from the network that ships, or else from `simulated`: true ones with errors. The
     confusion is measured on other drives than the evaluated one. OUT holds the tables
     (evaluation.txt, .json, .csv), the measured confusion matrix and pictures.
     """
     from hdmap_tools.evaluate.run import PRESETS, evaluate_all, pooled_text
-    from hdmap_tools.segmentation.shipped import STREET_SMALL
+    from hdmap_tools.segmentation.shipped import network_for_simulated_drives
     from hdmap_tools.steps import Steps
 
     preset = PRESETS[given["preset"]]
@@ -61,7 +61,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     if given["resolution"] is None:
         fixed["fusion__resolution_m"] = preset.resolution_m
     if given["model"] is None:
-        fixed["segmentation__model"] = STREET_SMALL
+        fixed["segmentation__model"] = network_for_simulated_drives()
     config = options.resolve_config(given, **fixed)
     settings = settings_of(
         {

@@ -35,6 +35,7 @@ _COMMANDS: Final = {
     "reliability": "Hold a map's probabilities against truth, and fit the temperature that makes them true.",
     "calibrate": "Find a camera's lens and mount, and check them by eye.",
     "merge": "Add semantic maps: the sum equals the map built from all drives at once.",
+    "history": "List the versions of a semantic map, compare them, go back to one.",
     "simulate": "Drive through a map: images, lidar sweeps, poses, and their exact truth.",
     "evaluate": "Measure the paper's methods and ours on simulated drives with exact truth.",
     "demo": "Simulate a short drive, map it, and hold the map against the truth.",

@@ -14,6 +14,7 @@ from hdmap_tools.cli import options
 @click.argument("maps", type=options.PATH, nargs=-1, required=True)
 @click.option("-o", "--out", type=options.PATH, required=True, help="Semantic map to make.")
 @click.option("--subtract", type=options.PATH, multiple=True, help="Take this map out; repeatable.")
+@click.option("--force", is_flag=True, help="Add a drive that is in the sum already once more.")
 @options.overwrite_option
 def command(maps: tuple[Path, ...], out: Path, subtract: tuple[Path, ...], **given: Any) -> None:
     """Add semantic maps: the sum equals the map built from all drives at once.
@@ -25,7 +26,9 @@ def command(maps: tuple[Path, ...], out: Path, subtract: tuple[Path, ...], **giv
     """
     from hdmap_tools.single_steps import merge_maps
 
-    merged = merge_maps(maps, subtract, out, overwrite=given["overwrite"])
+    merged = merge_maps(
+        maps, subtract, out, allow_repeats=given["force"], overwrite=given["overwrite"]
+    )
     drives = ", ".join(
         f"{name} ({entry['num_frames']} images)" for name, entry in merged.drives.items()
     )

@@ -44,6 +44,9 @@ _HALF: Final = LATTICE_CELLS // 2
 _REQUIRED_FOLDERS: Final = {"refs", "snapshots"}
 _KNOWN_FOLDERS: Final = _REQUIRED_FOLDERS | {"chunks", "manifests", "transactions", "config.yaml"}
 
+ROLLED_BACK_TO: Final = "rolled_back_to"
+"""In a version's metadata: the id of the earlier one that it equals."""
+
 Drives = dict[str, dict[str, Any]]
 """What a map holds, by drive id: ``{"num_frames": n}``."""
 
@@ -165,6 +168,7 @@ class SemanticMap:
             return [
                 Version(info.id, info.written_at, info.message, dict(info.metadata))
                 for info in self._repository.ancestry(**start)
+                if info.parent_id is not None  # before the first there is not even an empty map
             ]
 
     def tile_indices(self) -> tuple[TileIndex, ...]:
@@ -233,12 +237,54 @@ class SemanticMap:
         part = {} if segment is None else {"segment": segment}
         return self._apply(tiles, shift, 1, message or f"Add {drive_id}", lambda _: drives, part)
 
-    def merge(self, other: SemanticMap, name: str = "") -> str:
+    def subtract_counts(self, counts: CellCounts, drive_id: str) -> str:
+        """Take counts of a drive out and commit; returns the version's id.
+
+        Raises:
+            MapMismatchError: If the map does not hold them.
+            StoreError: If the commit fails; the map then stays as it was.
+        """
+        self.meta.require_compatible(counts.meta)
+        drives = {drive_id: {"num_frames": counts.num_frames}}
+        tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
+        shift = self._shift_mm(counts.meta)
+        return self._apply(tiles, shift, -1, f"Take out {drive_id}", lambda _: drives)
+
+    def replace(
+        self,
+        tiles: Iterator[tuple[TileIndex, Tile]],
+        drives: Drives,
+        message: str,
+        metadata: dict[str, Any],
+    ) -> str:
+        """Write tiles as they are, in place of what is there, and commit; returns the version's id.
+
+        Raises:
+            StoreError: If the commit fails; the map then stays as it was.
+        """
+        import zarr
+
+        with self._writing() as session:
+            group = zarr.open_group(session.store)
+            for index, tile in tiles:
+                _write_tile(group, index, tile)
+            group.attrs["drives"] = drives
+            group.attrs["num_tiles"] = len(_listed(session))
+            version: str = session.commit(message, metadata={"drives": {}} | metadata)
+        return version
+
+    def tile(self, index: TileIndex) -> Tile:
+        """One tile; without any evidence where the map holds none."""
+        with self._reading():
+            return _read_tile(self._group(), index)
+
+    def merge(self, other: SemanticMap, name: str = "", *, allow_repeats: bool = False) -> str:
         """Add all that another map holds, tile by tile.
 
         Args:
             other: The map to add.
             name: What to call it in history and messages; its folder's name if empty.
+            allow_repeats: Add a drive that is in the map already once more.
 
         Raises:
             MapMismatchError: If the maps are not compatible, or hold a drive in common.
@@ -248,7 +294,7 @@ class SemanticMap:
 
         def checked(held: Drives) -> Drives:
             common = sorted(held.keys() & theirs.keys())
-            if common:
+            if common and not allow_repeats:
                 raise MapMismatchError(
                     f"Both maps hold {', '.join(common)}; adding it twice would count it twice. "
                     "Subtract it from one of them first."
@@ -314,6 +360,26 @@ class SemanticMap:
         """Add (sign 1) or subtract tiles and commit; the drives are checked in the same session."""
         import zarr
 
+        with self._writing() as session:
+            group = zarr.open_group(session.store)
+            drives = checked_drives(_drives_of(group))
+            for index, tile in tiles:
+                if not tile.is_empty:
+                    held = _read_tile(group, index)
+                    shifted = shift_heights(tile, shift_mm)
+                    _write_tile(group, index, combine_tiles(held, shifted, sign, index))
+            if drives:
+                group.attrs["drives"] = _changed_drives(_drives_of(group), drives, sign)
+                group.attrs["num_tiles"] = len(_listed(session))
+            if not session.has_uncommitted_changes:
+                return session.snapshot_id
+            metadata = {"drives": drives, "sign": sign} | (more or {})
+            version: str = session.commit(message, metadata=metadata)
+            return version
+
+    @contextmanager
+    def _writing(self) -> Iterator[icechunk.Session]:
+        """A session to write in and commit; discarded if that is refused."""
         if self._version is not None:
             raise StoreError(f"{self.path} is open at an old version, which cannot be changed.")
         failed = (
@@ -323,21 +389,7 @@ class SemanticMap:
         with _store_errors(failed):
             session = self._repository.writable_session(_BRANCH)
             try:
-                group = zarr.open_group(session.store)
-                drives = checked_drives(_drives_of(group))
-                for index, tile in tiles:
-                    if not tile.is_empty:
-                        held = _read_tile(group, index)
-                        shifted = shift_heights(tile, shift_mm)
-                        _write_tile(group, index, combine_tiles(held, shifted, sign, index))
-                if drives:
-                    group.attrs["drives"] = _changed_drives(_drives_of(group), drives, sign)
-                    group.attrs["num_tiles"] = len(_listed(session))
-                if not session.has_uncommitted_changes:
-                    return session.snapshot_id
-                return session.commit(
-                    message, metadata={"drives": drives, "sign": sign} | (more or {})
-                )
+                yield session
             except HDMapError:
                 session.discard_changes()
                 raise

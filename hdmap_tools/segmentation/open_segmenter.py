@@ -29,13 +29,16 @@ from hdmap_tools.segmentation.precomputed import (
     require_label_folder,
 )
 from hdmap_tools.segmentation.segmenter import ModelProfile, Segmenter
-from hdmap_tools.segmentation.shipped import SHIPPED, STREET_SMALL, is_shipped, shipped_network
+from hdmap_tools.segmentation.shipped import (
+    SHIPPED,
+    SIMULATED,
+    STREET_SMALL,
+    is_shipped,
+    shipped_network,
+)
 from hdmap_tools.segmentation.tiling import Tiling
 
 _log = logging.getLogger(__name__)
-
-SIMULATED = "simulated"
-"""As a model: the true label images of a simulated drive, with errors."""
 
 NAMED_MODELS = (SIMULATED, *SHIPPED)
 """Models that are known by name and are no paths."""

@@ -14,6 +14,15 @@ STREET_SMALL: Final = "street-small"
 SHIPPED: Final = (STREET_SMALL,)
 
 
+SIMULATED: Final = "simulated"
+"""As a model: the true label images of a simulated drive, with errors."""
+
+
+def network_for_simulated_drives() -> str:
+    """What labels a simulated drive where nothing is asked for: the shipped network, if it is there."""
+    return STREET_SMALL if is_shipped(STREET_SMALL) else SIMULATED
+
+
 def networks_folder() -> Path:
     """Where they lie."""
     return Path(str(resources.files("hdmap_tools.segmentation"))) / "networks"

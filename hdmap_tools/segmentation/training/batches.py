@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.segmentation.training.augmentation import Augment
 from hdmap_tools.segmentation.training.image_pairs import ImagePairs
-from hdmap_tools.types import NDArrayInt
+from hdmap_tools.types import NDArrayByte, NDArrayInt
 
 _ORDER, _AUGMENTATION = 0, 1
 
@@ -36,6 +37,50 @@ def indices_of_step(step: int, batch: int, num_pairs: int, seed: int) -> NDArray
         chosen = epochs == epoch
         indices[chosen] = order[positions[chosen] % num_pairs]
     return indices
+
+
+class Kept:
+    """Images and labels that stay in memory once they were read, as far as there is room; `ImagePairs`.
+
+    Args:
+        pairs: To be read.
+        max_bytes: Of all that is kept.
+    """
+
+    def __init__(self, pairs: ImagePairs, max_bytes: int) -> None:
+        self._pairs = pairs
+        self._left = max_bytes
+        self._kept: dict[int, tuple[NDArrayByte, NDArrayByte]] = {}
+
+    @property
+    def name(self) -> str:
+        """Of the pairs."""
+        return self._pairs.name
+
+    @property
+    def label_set(self) -> LabelSet:
+        """Of the pairs."""
+        return self._pairs.label_set
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def describe(self, index: int) -> str:
+        """Names the files, for messages."""
+        return self._pairs.describe(index)
+
+    def read(self, index: int) -> tuple[NDArrayByte, NDArrayByte]:
+        """An image and its labels; not to be written to."""
+        pair = self._kept.get(index)
+        if pair is None:
+            pair = self._pairs.read(index)
+            size = pair[0].nbytes + pair[1].nbytes
+            if size <= self._left:
+                self._left -= size
+                for array in pair:
+                    array.setflags(write=False)
+                self._kept[index] = pair
+        return pair
 
 
 class Batches:

@@ -80,6 +80,10 @@ class TrainPreset(BaseModel):
         optimizer: With its schedule.
         batch: Images a step, over all processes.
         epochs: Times that each training image is seen.
+        judges_every_second_pixel: A step's loss is that of every second row and column, in
+            turn of each; for ``street_net``.
+        overlap_weight: Of a second loss, one minus the soft overlap (Dice) of each label of the
+            batch, which counts thin and rare things as much as large ones.
         max_gradient_norm: Longer gradients are cut to this length; None: never.
         class_weight_power: Labels are weighted in the loss by their frequency to minus
             this power; 0: alike.
@@ -101,6 +105,8 @@ class TrainPreset(BaseModel):
     batch: _Count
     epochs: _Count
     max_gradient_norm: _Positive | None = None
+    judges_every_second_pixel: bool = False
+    overlap_weight: Annotated[float, Field(ge=0)] = 0.0
     class_weight_power: Annotated[float, Field(ge=0, le=1)] = 0.0
     validate_epochs: _Count = 1
     validate_min_steps: _Count = 50
@@ -128,6 +134,8 @@ PRESETS: Final[dict[str, TrainPreset]] = {
             # warm-up, which goes by time, had few steps.
             optimizer=AdamW(learning_rate=3e-3),
             max_gradient_norm=1.0,
+            judges_every_second_pixel=True,
+            overlap_weight=0.5,
             batch=8,
             epochs=20,
             class_weight_power=0.25,

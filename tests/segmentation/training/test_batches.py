@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch")
 
 from hdmap_tools.errors import LabelError  # noqa: E402
 from hdmap_tools.segmentation.training.augmentation import Augment, Augmentation  # noqa: E402
-from hdmap_tools.segmentation.training.batches import Batches, indices_of_step  # noqa: E402
+from hdmap_tools.segmentation.training.batches import Batches, Kept, indices_of_step  # noqa: E402
 from hdmap_tools.segmentation.training.class_weights import class_weights  # noqa: E402
 
 AUGMENT = Augment(Augmentation(crop_px=32, scale=(0.8, 1.25), noise=0.05))
@@ -91,3 +91,36 @@ def test_a_label_that_never_occurs_weighs_as_the_rarest_that_does(toy_pairs):
     weights = class_weights(Dark(), 0.5, 0)
     assert np.isfinite(weights).all()
     assert weights[2] == weights[1]
+
+
+class Counted:
+    """Pairs that know how often they were read."""
+
+    name, label_set = "counted", None
+
+    def __init__(self, number):
+        self.reads = [0] * number
+
+    def __len__(self):
+        return len(self.reads)
+
+    def read(self, index):
+        self.reads[index] += 1
+        return np.full((10, 10, 3), index, np.uint8), np.full((10, 10), index, np.uint8)
+
+    def describe(self, index):
+        return f"number {index}"
+
+
+def test_what_fits_stays_in_memory():
+    pairs = Counted(5)
+    kept = Kept(pairs, 2 * 400 + 399)
+    for _ in range(3):
+        for index in range(5):
+            rgb, ids = kept.read(index)
+            assert (rgb == index).all()
+            assert (ids == index).all()
+    assert pairs.reads == [1, 1, 3, 3, 3]
+    assert (len(kept), kept.name, kept.describe(2)) == (5, "counted", "number 2")
+    with pytest.raises(ValueError, match="read-only"):
+        kept.read(0)[0][:] = 0
