@@ -389,9 +389,9 @@ def build_map(
                 yield image, looked_at.pop(image)
         before += len(some) - len(rest)
 
-        def told(number: int, _: int) -> None:
+        def told(done: int, total: int) -> None:  # noqa: ARG001 - of this segment
             if steps.segmented is not None:
-                steps.segmented(before + number, len(images))
+                steps.segmented(before + done, len(images))
 
         yield from segment_drive(drive, segmenter, rest, cache, told)
 
