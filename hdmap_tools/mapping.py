@@ -389,7 +389,7 @@ def build_map(
                 yield image, looked_at.pop(image)
         before += len(some) - len(rest)
 
-        def told(done: int, total: int) -> None:  # noqa: ARG001 - of this segment
+        def told(done: int, total: int) -> None:
             if steps.segmented is not None:
                 steps.segmented(before + done, len(images))
 
