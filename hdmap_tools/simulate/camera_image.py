@@ -122,7 +122,7 @@ def _shaded(
     light: Light,
     time_s: float,
 ) -> NDArrayFloat32:
-    from hdmap_tools.simulate.compiled import in_bands
+    from hdmap_tools.simulate.compiled import ENOUGH_ROWS, in_bands
     from hdmap_tools.simulate.shading import shade
 
     texture = prepare_textures(caster)
@@ -159,7 +159,7 @@ def _shaded(
             image,
         )
 
-    in_bands(shade_band, camera.height_px)
+    in_bands(shade_band, camera.height_px, ENOUGH_ROWS)
     return image
 
 
@@ -172,7 +172,7 @@ def _sunlight(
     time_s: float,
 ) -> NDArrayFloat32:
     """(N,) how much of the sun each hit gets; all of it where shadows are not worth a ray."""
-    from hdmap_tools.simulate.compiled import in_bands
+    from hdmap_tools.simulate.compiled import ENOUGH_ROWS, in_bands
     from hdmap_tools.simulate.shadow_kernels import spread_sunlight, sun_rays
 
     sunlight = np.ones(len(rays), np.float32)
@@ -198,7 +198,7 @@ def _sunlight(
         hits.normal.reshape(*shape, 3),
         sunlight.reshape(shape),
     )
-    in_bands(lambda first, last: spread_sunlight(first, last, *arrays), shape[0])
+    in_bands(lambda first, last: spread_sunlight(first, last, *arrays), shape[0], ENOUGH_ROWS)
     return sunlight
 
 

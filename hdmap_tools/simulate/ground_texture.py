@@ -69,7 +69,7 @@ def _worn(albedo: NDArrayFloat32) -> NDArrayAny:
 
 def ground_texture(surface: SurfaceRaster) -> GroundTexture:
     """The texture of a surface raster; half a second for 100 million cells."""
-    from hdmap_tools.simulate.compiled import in_bands
+    from hdmap_tools.simulate.compiled import ENOUGH_ROWS, in_bands
     from hdmap_tools.simulate.texture_kernels import first_level, next_level
 
     albedo = albedo_table()
@@ -86,6 +86,7 @@ def ground_texture(surface: SurfaceRaster) -> GroundTexture:
     in_bands(
         lambda first, last: first_level(first, last, surface.codes, surface.wear, cells, levels[0]),
         len(levels[0]),
+        ENOUGH_ROWS,
     )
     for finer, coarser in itertools.pairwise(levels):
         next_level(0, len(coarser), finer, coarser)
