@@ -36,7 +36,7 @@ def test_termination_leaves_no_temporary_folder(street, command):
     )
     try:
         assert process.stdout.readline() == "fusing\n", process.stderr.read()
-        assert list(street.glob(".out.*.partial"))
+        assert list(street.glob(".out.*"))
         process.send_signal(signal.SIGTERM)
         _, err = process.communicate(timeout=30)
     finally:

@@ -132,13 +132,13 @@ PRESETS: Final[dict[str, TrainPreset]] = {
             network="street_net",
             # Without a limit to the gradient the loss went to NaN where a slow machine's
             # warm-up, which goes by time, had few steps.
-            optimizer=AdamW(learning_rate=3e-3),
+            optimizer=AdamW(learning_rate=1e-2, warm_up=0.05),
             max_gradient_norm=1.0,
             judges_every_second_pixel=True,
-            overlap_weight=0.5,
+            overlap_weight=0.3,
             batch=8,
             epochs=20,
-            class_weight_power=0.25,
+            class_weight_power=0.4,
             # On two cores a look at sixty images takes as long as twenty steps.
             validate_epochs=3,
             validate_images=60,
