@@ -51,6 +51,7 @@ def toy_settings(**changes):
             "batch": 4,
             "optimizer": AdamW(learning_rate=5e-3),
             "augmentation": Augmentation(scale=(0.8, 1.25), crop_px=48),
+            "validate_epochs": 1,
             "validate_min_steps": 5,
             **changes.pop("preset", {}),
         }
