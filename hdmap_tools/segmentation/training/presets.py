@@ -12,8 +12,8 @@ U-Net, MobileNetV3-small (0.5)    0.78 M      81 ms    1.18 s
 `street_net`                      1.01 M      69 ms    0.55 s
 ================================  ==========  =======  ======
 
-The last one's step judges every second pixel only, the others all. The first is 8.6 MB, above the 5 MB that a shipped network may have, and sees detail at a
-quarter of the resolution only.
+The last one's step judges every second pixel only, the others all. The first is 8.6 MB, above
+the 5 MB that a shipped network may have, and sees detail at a quarter of the resolution only.
 """
 
 from __future__ import annotations
