@@ -6,6 +6,8 @@ import sys
 import pytest
 
 torch = pytest.importorskip("torch")
+pytest.importorskip("torchvision")
+pytest.importorskip("segmentation_models_pytorch")
 
 from hdmap_tools.cli.main import main  # noqa: E402
 from hdmap_tools.segmentation.embedded import read_embedded  # noqa: E402
