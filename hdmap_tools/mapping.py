@@ -424,7 +424,8 @@ def build_map(
             f"Check the mounts of {', '.join(silent)} and of the lidar (`hdmap info`), and that sweeps hold "
             "the ground around the vehicle."
         )
-    if silent:
+    # What the segments of an earlier call saw is not known here.
+    if silent and not done:
         why = "check their mounts"
         if source.methods[0] == "dense":
             why = "method dense labels only what lies ahead of the vehicle; else check their mounts"

@@ -164,8 +164,8 @@ def _steps(semantic_map: SemanticMap) -> Iterator[tuple[Version, Version]]:
 
 def _both(one: SemanticMap, other: SemanticMap) -> Iterator[tuple[TileIndex, Tile, Tile]]:
     """Tiles of two versions side by side, those that either holds; empty where one has none."""
-    for index in sorted({*one.tile_indices(), *other.tile_indices()}):
-        yield index, one.tile(index), other.tile(index)
+    indices = sorted({*one.tile_indices(), *other.tile_indices()})
+    yield from zip(indices, one.tiles(indices), other.tiles(indices), strict=True)
 
 
 def _frames(semantic_map: SemanticMap, drive_id: str) -> int:

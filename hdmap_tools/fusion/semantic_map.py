@@ -9,7 +9,7 @@ On a local disk exactly one process may commit at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -230,12 +230,8 @@ class SemanticMap:
             MapMismatchError: If the counts are of another kind of map, or overflow.
             StoreError: If the commit fails; the map then stays as it was.
         """
-        self.meta.require_compatible(counts.meta)
-        drives = {drive_id: {"num_frames": counts.num_frames}}
-        tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
-        shift = self._shift_mm(counts.meta)
         part = {} if segment is None else {"segment": segment}
-        return self._apply(tiles, shift, 1, message or f"Add {drive_id}", lambda _: drives, part)
+        return self._apply_counts(counts, drive_id, 1, message or f"Add {drive_id}", part)
 
     def subtract_counts(self, counts: CellCounts, drive_id: str) -> str:
         """Take counts of a drive out and commit; returns the version's id.
@@ -244,11 +240,7 @@ class SemanticMap:
             MapMismatchError: If the map does not hold them.
             StoreError: If the commit fails; the map then stays as it was.
         """
-        self.meta.require_compatible(counts.meta)
-        drives = {drive_id: {"num_frames": counts.num_frames}}
-        tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
-        shift = self._shift_mm(counts.meta)
-        return self._apply(tiles, shift, -1, f"Take out {drive_id}", lambda _: drives)
+        return self._apply_counts(counts, drive_id, -1, f"Take out {drive_id}", {})
 
     def replace(
         self,
@@ -273,10 +265,14 @@ class SemanticMap:
             version: str = session.commit(message, metadata={"drives": {}} | metadata)
         return version
 
-    def tile(self, index: TileIndex) -> Tile:
-        """One tile; without any evidence where the map holds none."""
+    def tiles(self, indices: Iterable[TileIndex]) -> Iterator[Tile]:
+        """Some tiles, one after the other; without any evidence where the map holds none."""
         with self._reading():
-            return _read_tile(self._group(), index)
+            group = self._group()
+        for index in indices:
+            with self._reading():
+                tile = _read_tile(group, index)
+            yield tile
 
     def merge(self, other: SemanticMap, name: str = "", *, allow_repeats: bool = False) -> str:
         """Add all that another map holds, tile by tile.
@@ -347,6 +343,15 @@ class SemanticMap:
                 return _read_tile(group, index)
 
         return read
+
+    def _apply_counts(
+        self, counts: CellCounts, drive_id: str, sign: int, message: str, more: dict[str, Any]
+    ) -> str:
+        self.meta.require_compatible(counts.meta)
+        drives = {drive_id: {"num_frames": counts.num_frames}}
+        tiles = ((i, counts.tiles[i]) for i in sorted(counts.tiles))
+        shift = self._shift_mm(counts.meta)
+        return self._apply(tiles, shift, sign, message, lambda _: drives, more)
 
     def _apply(
         self,

@@ -28,18 +28,6 @@ def compiled_fast(function: F) -> F:
     return result
 
 
-def compiled_inline(function: F) -> F:
-    """The same, written out where it is called.
-
-    An array handed to a compiled function is counted on the way in and out, atomically;
-    called for every pixel on two cores, that takes longer than the work.
-    """
-    result: F = numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always"
-    )(function)
-    return result
-
-
 ENOUGH_RAYS: Final = 70_000
 """Rays that are worth a thread of their own. A sweep of 131,000 is done by one: two of them side by
 side on two cores took a fifth less time without threads within each."""
