@@ -39,7 +39,7 @@ $(READY): pyproject.toml constraints.txt
 	  rm -rf $(VENV); exit 1; }
 	$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1' # the first that knows --group
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --group dev
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[openvino,lidar]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[openvino,lidar,distributed]'
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-deps --group av2
 	@# av2 lacks dependencies on purpose (see pyproject.toml), nothing else may.
 	@! $(BIN)/python -m pip check | grep -v -e '^av2 ' -e '^No broken'
@@ -59,7 +59,7 @@ test-train: $(TRAIN) ## Install torch (5 GB more) and run the tests of training,
 
 # The core must work without torch, so what tests it runs before this.
 $(TRAIN): $(READY)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[openvino,lidar,train]'
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[openvino,lidar,distributed,train]'
 	@touch $@
 
 test-all: $(READY) ## Run all tests, the slow ones too

@@ -13,7 +13,8 @@ from hdmap_tools.compare.reference import is_truth_raster
 from hdmap_tools.errors import FormatError
 from hdmap_tools.formats.by_name import is_readable, read_vector_map
 from hdmap_tools.fusion.cell_counts import TILE_CELLS
-from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
+from hdmap_tools.fusion.map_store import is_semantic_map
+from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.point_map.point_files import is_point_file, read_point_file
 from hdmap_tools.point_map.point_map import META_NAME, TILE_MM, PointMap
 from hdmap_tools.readers.open_drive import open_drive

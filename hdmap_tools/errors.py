@@ -131,6 +131,10 @@ class OutputExistsError(HDMapError, FileExistsError):
     """The output exists already and was not to be overwritten."""
 
 
+class ClusterError(HDMapError, RuntimeError):
+    """A cluster cannot be reached, or its workers die."""
+
+
 class MissingExtraError(HDMapError, ImportError):
     """An optional dependency is needed and not installed."""
 

@@ -23,6 +23,7 @@ from hdmap_tools.association.surface import associate_surface
 from hdmap_tools.config import AssociationConfig, Config
 from hdmap_tools.errors import ConfigError, DriveError, PointMapError, PoseError
 from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.dense_fusion import DenseFusion
 from hdmap_tools.fusion.intensity import otsu_threshold
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import SemanticMap
@@ -31,7 +32,7 @@ from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
 from hdmap_tools.opening import require_images
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
-from hdmap_tools.segmentation.cache import LabelCache, segment_drive
+from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_drive
 from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
@@ -40,6 +41,9 @@ from hdmap_tools.types import NDArrayByte
 _LOG = logging.getLogger(__name__)
 
 LabelledImages = Iterable[tuple[ImageRef, NDArrayByte]]
+
+Elsewhere = Callable[[SemanticMap, list[int], "FrameCounts", "SegmentProgress | None"], None]
+"""Adds segments, by number, to a map; tells counts what went in, and progress of it."""
 
 _THRESHOLD_WITHOUT_LIDAR = 128
 _IMAGES_FOR_THRESHOLD = 24
@@ -115,6 +119,7 @@ class FrameSource:
         self._config = config
         self.sweeps = sweeps or GroundedSweeps(drive, config)
         self._points: PointMap | None = None
+        self._engine: DenseFusion | None = None
         if config.association.needs_points:
             if config.association.points is None:
                 raise PointMapError(
@@ -176,6 +181,20 @@ class FrameSource:
         """The sweep nearest to an image, with its ground."""
         return self.sweeps.near(image)
 
+    def count(self, method: str, image: ImageRef, labels: NDArrayByte, counts: CellCounts) -> int:
+        """Add what one image says of the ground to counts; gives how many points it labelled."""
+        meta, key = counts.meta, frame_key(image)
+        if method != "dense" or meta.range_edges_m:
+            seen = self.observe(method, image, labels, meta.label_set, meta.resolution_m)
+            counts.add(seen, key)
+            return len(seen)
+        assert self._points is not None
+        if self._engine is None or self._engine.meta != meta:
+            self._engine = DenseFusion(self._points, meta, self._config.association)
+        camera, grounded = self._drive.cameras[image.camera], self.grounded_sweep(image)
+        live = () if grounded is None else (grounded.standing_city, grounded.ring_gap_deg)
+        return self._engine.add(counts, labels, camera, self.pose(image.timestamp_ns), key, *live)
+
     def observe(
         self,
         method: str,
@@ -224,7 +243,7 @@ class FrameSource:
                 pose,
                 self._points.points_in(clip_bounds_m(pose, config)),
                 config,
-                None if grounded is None else grounded.points_city[~grounded.is_ground],
+                None if grounded is None else grounded.standing_city,
                 2.1 if grounded is None else grounded.ring_gap_deg,
             )
         if grounded is None:
@@ -267,18 +286,34 @@ def fuse(
         counts: Told how many images were used, and what they saw.
     """
     segments = {method: CellCounts(meta) for method in source.methods}
+    count_images(source, labelled, segments, counts)
+    for method, segment in segments.items():
+        if segment.num_frames:
+            commits[method](segment)
+
+
+def count_images(
+    source: FrameSource,
+    labelled: LabelledImages,
+    segments: Mapping[str, CellCounts],
+    counts: FrameCounts,
+) -> None:
+    """Add labelled images to counts, by each method on its own.
+
+    Args:
+        source: Poses and sweeps.
+        labelled: Images with their label images.
+        segments: Counts by method, changed.
+        counts: Told how many images were used, and what they saw.
+    """
     for image, labels in labelled:
         for method, segment in segments.items():
             if not source.allows(method, image):
                 continue
-            seen = source.observe(method, image, labels, meta.label_set, meta.resolution_m)
-            segment.add(seen, frame_key(image))
+            seen = source.count(method, image, labels, segment)
             if method == source.methods[0]:
-                counts.observations[image.camera] += len(seen)
+                counts.observations[image.camera] += seen
         counts.used += 1
-    for method, segment in segments.items():
-        if segment.num_frames:
-            commits[method](segment)
 
 
 def frame_key(image: ImageRef) -> int:
@@ -340,6 +375,7 @@ def build_map(
     steps: Steps,
     also_in: Path | None = None,
     resume: bool = False,
+    elsewhere: Elsewhere | None = None,
 ) -> tuple[dict[str, SemanticMap], FrameCounts]:
     """Segment, associate and fuse a drive into new semantic maps, one for each method.
 
@@ -357,6 +393,8 @@ def build_map(
             None leaves them out.
         resume: Go on with the map at `path`, if there is one: made from the same drive,
             network and configuration.
+        elsewhere: Counts the segments of the configured method in other processes; None:
+            they are counted here.
 
     Returns:
         Maps by method, the configured one first; and what went in.
@@ -410,11 +448,13 @@ def build_map(
         if done:
             _LOG.info("Going on after %d segments that are in the map already.", len(done))
         size = config.fusion.images_per_segment
-        for number in range(-(-len(images) // size)):
+        pending = [n for n in range(-(-len(images) // size)) if n not in done]
+        counts.used += sum(len(images[n * size : (n + 1) * size]) for n in done)
+        if elsewhere is not None:
+            elsewhere(maps[source.methods[0]], pending, counts, steps.segmented)
+            pending = []
+        for number in pending:
             some = images[number * size : (number + 1) * size]
-            if number in done:
-                counts.used += len(some)
-                continue
             commits = {m: partial(_commit, made, drive.id, number) for m, made in maps.items()}
             fuse(source, labels_again(some, number * size), meta, commits, counts)
     silent = sorted({i.camera for i in images} - {c for c, n in counts.observations.items() if n})

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from hdmap_tools.errors import OutputExistsError, StoreError
-from hdmap_tools.fusion.semantic_map import is_semantic_map
+from hdmap_tools.fusion.map_store import is_semantic_map
 
 MARKER: Final = ".hdmap-result.json"
 """Says which command made a folder, and what it wrote into it."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Sequence
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,20 @@ import hdmap_tools
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.config import Config
+from hdmap_tools.distributed.build import Workers, add_segments, connected
+from hdmap_tools.distributed.count_segment import SegmentTask
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
+from hdmap_tools.fusion.map_store import is_semantic_map
+from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
-from hdmap_tools.mapping import build_map, map_meta
+from hdmap_tools.mapping import FrameCounts, build_map, map_meta
 from hdmap_tools.opening import open_configured, open_for
 from hdmap_tools.output_folder import map_folder, require_free
 from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import Drive
-from hdmap_tools.segmentation.cache import LabelCache
+from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
@@ -42,6 +47,7 @@ def build_alone(
     cache: LabelCache | None = None,
     overwrite: bool = False,
     resume: bool = True,
+    workers: Workers | None = None,
     steps: Steps | None = None,
 ) -> dict[str, Any]:
     """`build_map` into a place of its own: a new map that is whole or not there.
@@ -57,6 +63,7 @@ def build_alone(
         cache: Where label images are kept between runs.
         overwrite: Replace an earlier map.
         resume: Go on with an unfinished build of the same; off, it is thrown away.
+        workers: Processes to spread it over; None: all is done in this one.
         steps: Told of progress.
 
     Returns:
@@ -78,9 +85,21 @@ def build_alone(
     ) as work:
         with steps.timed("points"):
             config, drive = with_points(config, drive, work / "scratch")
-        maps, counts = build_map(
-            drive, segmenter, work / out.name, config, cache, steps, resume=True
-        )
+        with ExitStack() as stack:
+            elsewhere = None
+            if workers is not None:
+                client = stack.enter_context(connected(workers))
+                elsewhere = partial(_elsewhere, client, drive_path, drive, config, cache)
+            maps, counts = build_map(
+                drive,
+                segmenter,
+                work / out.name,
+                config,
+                cache,
+                steps,
+                resume=True,
+                elsewhere=elsewhere,
+            )
         made = maps[config.association.method]
         report = {
             "drive": drive.id,
@@ -93,6 +112,21 @@ def build_alone(
     return report | {
         "seconds": {name: round(value, 3) for name, value in steps.seconds.items()},
     }
+
+
+def _elsewhere(
+    client: Any,
+    drive_path: Path,
+    drive: Drive,
+    config: Config,
+    cache: LabelCache | None,
+    semantic_map: SemanticMap,
+    numbers: list[int],
+    counts: FrameCounts,
+    segmented: SegmentProgress | None,
+) -> None:
+    task = SegmentTask.of(drive_path, config, semantic_map.meta, cache, len(drive.images))
+    add_segments(client, task, drive.id, semantic_map, numbers, counts, segmented)
 
 
 def _plan(drive: Drive, segmenter: Segmenter, config: Config) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from hdmap_tools.association.lookup import speaks_of_ground
 from hdmap_tools.association.observations import Observations
-from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, widened
+from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, depth_shape, widened
 from hdmap_tools.config import AssociationConfig
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
@@ -73,29 +73,48 @@ def associate_dense(
     )
     hides_from_m = np.zeros((0, 0))
     if config.occlusion_test:
-        shape = (-(-camera.height_px // CELL_PX), -(-camera.width_px // CELL_PX))
-        depth = np.full(shape, np.inf)
+        depth = np.full(depth_shape(camera), np.inf)
         lay_depth(depth, *seen, points.is_ground, CELL_PX, NEAREST_M)
-        hides_from_m = widened(depth, camera, _MAP_GAP_DEG, _MAP_GAP_DEG) + MARGIN_M
+        hides_from_m = widened(depth, camera, MAP_GAP_DEG, MAP_GAP_DEG) + MARGIN_M
         if standing_city is not None and len(standing_city):
-            live = see_points(
-                standing_city,
-                ego_SE3_city.rotation,
-                ego_SE3_city.translation,
-                (np.inf, np.inf, 0.0),
-                camera.ego_SE3_cam.translation,
-                *view,
-            )
-            depth = np.full(shape, np.inf)
-            lay_depth(depth, *live, np.zeros(len(standing_city), bool), CELL_PX, NEAREST_M)
-            live_from_m = widened(depth, camera, _SWEEP_GAP_DEG, ring_gap_deg) + MARGIN_M
-            hides_from_m = np.minimum(hides_from_m, live_from_m)
+            live = sweep_hides_from_m(standing_city, camera, city_SE3_ego, ring_gap_deg)
+            hides_from_m = np.minimum(hides_from_m, live)
     speaks = speaks_of_ground(np.arange(256, dtype=np.uint8), label_set)
     at, labels = look_up(*seen, points.is_ground, hides_from_m, CELL_PX, label_image, speaks)
     return Observations(points.points_city[at], labels, points.intensity[at])
 
 
-_MAP_GAP_DEG: Final = 0.4
+def sweep_hides_from_m(
+    standing_city: NDArrayFloat, camera: PinholeCamera, city_SE3_ego: SE3, ring_gap_deg: float
+) -> NDArrayFloat:
+    """Depth from which on the returns of a live sweep hide ground, by cell of `CELL_PX`.
+
+    Args:
+        standing_city: (M, 3) returns that are not ground, city metres.
+        camera: Calibrated camera.
+        city_SE3_ego: Ego pose at the image's own time.
+        ring_gap_deg: Angle between the sweep's rings, degrees.
+    """
+    from hdmap_tools.association.dense_kernels import lay_depth, see_points
+
+    cam_SE3_city = (city_SE3_ego @ camera.ego_SE3_cam).inverse()
+    ego_SE3_city = city_SE3_ego.inverse()
+    live = see_points(
+        standing_city,
+        ego_SE3_city.rotation,
+        ego_SE3_city.translation,
+        (np.inf, np.inf, 0.0),
+        camera.ego_SE3_cam.translation,
+        cam_SE3_city.rotation,
+        cam_SE3_city.translation,
+        *camera.lens,
+    )
+    depth = np.full(depth_shape(camera), np.inf)
+    lay_depth(depth, *live, np.zeros(len(standing_city), bool), CELL_PX, NEAREST_M)
+    return widened(depth, camera, _SWEEP_GAP_DEG, ring_gap_deg) + MARGIN_M
+
+
+MAP_GAP_DEG: Final = 0.4
 """Angle that a point of the map covers: 10 cm at 15 m."""
 _SWEEP_GAP_DEG: Final = 0.4
 """Angle between a sweep's returns within a ring."""

@@ -89,6 +89,11 @@ class GroundedSweep:
     is_ground: NDArrayBool
     ring_gap_deg: float
 
+    @cached_property
+    def standing_city(self) -> NDArrayFloat:
+        """(M, 3) the points that are not on the ground, city frame."""
+        return self.points_city[~self.is_ground]
+
     @classmethod
     def from_sweep(
         cls, sweep: Sweep, city_SE3_ego: SE3, max_range_m: float, tolerance_m: float

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hdmap_tools.cli import options
+
+if TYPE_CHECKING:
+    from hdmap_tools.distributed.build import Workers
 
 
 @click.command()
@@ -26,6 +29,18 @@ from hdmap_tools.cli import options
     show_default=True,
     help="Go on with a build that was killed, or throw it away.",
 )
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Spread the drive over so many processes of this machine.",
+)
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find drive, "
+    "network, point map and OUT under the same paths.",
+)
+@click.option("--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB.")
 @options.overwrite_option
 @options.json_option
 @options.config_options
@@ -37,6 +52,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     Examples:
       hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
       hdmap build path/to/next_drive -o map2 --like map
+      hdmap build path/to/drive -o map --workers 8
 
     A build that was killed goes on after its last commit when the same command is given
     again, and ends with the same map. The map is a versioned repository of counts; read it with `hdmap vectorize`,
@@ -55,6 +71,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             cache=options.label_cache(given["cache_folder"], given["no_cache"]),
             overwrite=given["overwrite"],
             resume=given["resume"],
+            workers=_workers(given),
             steps=Steps(segmented),
         )
     options.write_json(given["json_path"], report, overwrite=given["overwrite"])
@@ -62,3 +79,16 @@ def command(ctx: click.Context, /, **given: Any) -> None:
         f"{report['drive']}: {report['num_images']} images fused into {report['num_tiles']} tiles at "
         f"{given['out']} in {sum(report['seconds'].values()):.1f} s"
     )
+
+
+def _workers(given: dict[str, Any]) -> Workers | None:
+    from hdmap_tools.distributed.build import Workers
+
+    number, scheduler, memory = given["workers"], given["scheduler"], given["worker_memory"]
+    if number is not None and scheduler is not None:
+        raise click.UsageError("Give --workers or --scheduler, not both.")
+    if memory is not None and number is None:
+        raise click.UsageError("--worker-memory needs --workers.")
+    if number is None and scheduler is None:
+        return None
+    return Workers(number or 0, scheduler, memory)

@@ -9,7 +9,7 @@ drive can be taken out again, all exactly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,9 +18,9 @@ import numpy as np
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.errors import LabelError, MapMismatchError, ShapeError
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.voting import cast_votes
+from hdmap_tools.fusion.vote_kernels import MODES, by_tile_and_cell, vote
 from hdmap_tools.geometry.grid import BevGrid, cells_of
-from hdmap_tools.types import NDArrayAny, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
 
 TILE_CELLS: Final = 256
 """Cells a side of a tile, which is also a chunk of the store."""
@@ -69,6 +69,22 @@ class Tile:
     def is_empty(self) -> bool:
         """Whether nothing was observed anywhere."""
         return not any(layer.any() for layer in self.layers.values())
+
+
+def heights_in_mm(z_city: NDArrayFloat, meta: MapMeta) -> NDArrayAny:
+    """Heights (N,) int32 above a map's reference, of city heights (N,) in metres.
+
+    Raises:
+        ShapeError: If one is too far from the reference.
+    """
+    height_mm = np.rint((z_city - meta.reference_height_m) * 1000.0)
+    if len(height_mm) and np.abs(height_mm).max() > MAX_HEIGHT_MM:
+        raise ShapeError(
+            f"A ground point is {np.abs(height_mm).max() / 1000:.0f} m from the map's reference "
+            f"height {meta.reference_height_m} m; at most {MAX_HEIGHT_MM // 1000} m are held. "
+            "Set fusion.reference_height_m nearer to the ground."
+        )
+    return height_mm.astype(np.int32)
 
 
 class CellCounts:
@@ -127,35 +143,67 @@ class CellCounts:
                     "observations say no range."
                 )
             bins += 2 * np.searchsorted(self.meta.range_edges_m, observations.range_m, side="right")
-        votes = cast_votes(
-            cells,
-            observations.labels,
-            bins,
-            num_bins=num_bins,
-            mode=self.meta.count_mode,
-            frame_key=frame_key,
-        )
-        for index, rows, y, x in _by_tile(votes.cells):
-            counts = self._tile(index).layers["counts"].reshape(-1, TILE_CELLS, TILE_CELLS)
-            np.add.at(counts, (votes.channels[rows], y, x), votes.quanta[rows].astype(np.uint32))
-        height_mm = np.rint(
-            (observations.points_city[:, 2] - self.meta.reference_height_m) * 1000.0
-        )
-        if np.abs(height_mm).max() > MAX_HEIGHT_MM:
-            raise ShapeError(
-                f"A ground point is {np.abs(height_mm).max() / 1000:.0f} m from the map's reference "
-                f"height {self.meta.reference_height_m} m; at most {MAX_HEIGHT_MM // 1000} m are held. "
-                "Set fusion.reference_height_m nearer to the ground."
+        slots = (1 + observations.labels * np.int32(num_bins) + bins).astype(np.uint16)
+        height_mm = heights_in_mm(observations.points_city[:, 2], self.meta)
+        for index, order, starts, flat in by_tile_and_cell(cells, TILE_CELLS):
+            self.vote(
+                index,
+                (np.array([[0, len(flat)]]), starts, flat),
+                slots[order],
+                frame_key,
+                height_mm[order],
+                intensity[order],
+                has_intensity[order],
             )
-        height_mm = height_mm.astype(np.int64)
-        for index, rows, y, x in _by_tile(cells):
-            layers = self._tile(index).layers
-            flat = y * TILE_CELLS + x
-            _add_sums(layers, "height", flat, height_mm[rows], squared=True)
-            measured = has_intensity[rows]
-            _add_sums(
-                layers, "intensity", flat[measured], intensity[rows][measured].astype(np.int64)
-            )
+
+    def vote(
+        self,
+        index: TileIndex,
+        cells: tuple[NDArrayInt, NDArrayInt, NDArrayInt],
+        slots: NDArrayAny,
+        frame_key: int,
+        height_mm: NDArrayInt,
+        intensity: NDArrayByte,
+        has_intensity: NDArrayAny | None = None,
+        sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny] | None = None,
+    ) -> None:
+        """Add the votes of (part of) one frame in cells of one tile.
+
+        All points that the frame has in a cell must come at once; `num_frames` is not changed.
+
+        Args:
+            index: Of the tile.
+            cells: Ranges (R, 2) of cells, first point (K + 1,) of each cell, and the cell
+                (K,) in the tile, ``y * TILE_CELLS + x``.
+            slots: (N,) uint16 ``1 + label * num_bins + bin``; 0 where nothing was seen.
+            frame_key: Any number that names the frame.
+            height_mm: (N,) int32 above the reference height.
+            intensity: (N,) uint8.
+            has_intensity: (N,) bool; None: all have.
+            sums: By cell, of all points: height, its square, intensity; saves adding up.
+        """
+        layers = self._tile(index).layers
+        runs, starts, flat = cells
+        if sums is None:
+            sums = (np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint64))
+        vote(
+            runs,
+            starts,
+            flat,
+            (index[0] * TILE_CELLS, index[1] * TILE_CELLS),
+            TILE_CELLS,
+            slots,
+            self.meta.num_bins,
+            MODES[self.meta.count_mode],
+            np.uint64(frame_key & 0xFFFFFFFFFFFFFFFF),
+            height_mm,
+            intensity,
+            np.zeros(0, dtype=bool) if has_intensity is None else has_intensity,
+            sums,
+            layers["counts"].reshape(-1, TILE_CELLS * TILE_CELLS),
+            tuple(layers[f"height_{name}"].reshape(-1) for name in ("n", "sum", "sum_sq")),
+            tuple(layers[f"intensity_{name}"].reshape(-1) for name in ("n", "sum")),
+        )
 
     def merge(self, other: CellCounts) -> CellCounts:
         """The sum of both; equal to adding all frames of both to one.
@@ -298,38 +346,3 @@ def window_of_tiles(read: Callable[[TileIndex], Tile | None], grid: BevGrid, met
             for name, layer in window.layers.items():
                 layer[..., to[0], to[1]] = tile.layers[name][..., of[0], of[1]]
     return window
-
-
-def _by_tile(
-    cells: NDArrayInt,
-) -> Iterator[tuple[TileIndex, NDArrayInt, NDArrayInt, NDArrayInt]]:
-    """Group cells (N, 2) by tile: (tile, rows of the input, y in the tile, x in the tile)."""
-    if len(cells) == 0:
-        return
-    tiles = cells // TILE_CELLS
-    low = tiles.min(axis=0)
-    # Tiles as single numbers: sorting rows is many times slower.
-    height = int(tiles[:, 1].max() - low[1]) + 1
-    number = (tiles[:, 0] - low[0]) * height + tiles[:, 1] - low[1]
-    order = np.argsort(number, kind="stable")
-    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
-    for rows in np.split(order, starts[1:]):
-        tx, ty = tiles[rows[0]].tolist()
-        within = cells[rows] - (tx * TILE_CELLS, ty * TILE_CELLS)
-        yield (tx, ty), rows, within[:, 1], within[:, 0]
-
-
-def _add_sums(
-    layers: dict[str, NDArrayAny],
-    name: str,
-    flat: NDArrayInt,
-    values: NDArrayInt,
-    squared: bool = False,
-) -> None:
-    """Add number, sum and sum of squares of whole values to flat cells of a tile."""
-    pairs = [("n", np.ones(len(values), dtype=np.int64)), ("sum", values)]
-    if squared:
-        pairs.append(("sum_sq", values * values))
-    for suffix, amounts in pairs:
-        layer = layers[f"{name}_{suffix}"].reshape(-1)
-        np.add.at(layer, flat, amounts.astype(layer.dtype))

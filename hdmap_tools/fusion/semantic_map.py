@@ -1,9 +1,7 @@
 """The semantic map on disk: counts in an Icechunk repository, a version for every commit.
 
-Layout of the Zarr v3 group: one array a layer of `cell_counts.LAYERS`, spanning
-`LATTICE_CELLS` a side with a chunk a tile, so that only tiles with evidence
-take space; the map's meta and the drives it holds in the group's attributes.
-Chunks carry checksums: a damaged one is an error, never a wrong count.
+The Zarr v3 group holds the arrays of `map_store`, and in its attributes the map's meta and the
+drives that it holds.
 On a local disk exactly one process may commit at a time.
 """
 
@@ -14,16 +12,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
 from hdmap_tools.errors import HDMapError, MapMismatchError, OutputExistsError, StoreError
 from hdmap_tools.fusion.cell_counts import (
-    LATTICE_CELLS,
-    LAYERS,
-    TILE_CELLS,
     CellCounts,
     Tile,
     TileIndex,
@@ -33,6 +27,15 @@ from hdmap_tools.fusion.cell_counts import (
     window_of_tiles,
 )
 from hdmap_tools.fusion.map_meta import MAP_SCHEMA_VERSION, MapMeta
+from hdmap_tools.fusion.map_store import (
+    is_semantic_map,
+    listed_tiles,
+    make_arrays,
+    quiet_icechunk,
+    read_tile,
+    store_errors,
+    write_tile,
+)
 from hdmap_tools.geometry.grid import BevGrid
 
 if TYPE_CHECKING:
@@ -40,9 +43,6 @@ if TYPE_CHECKING:
     import zarr
 
 _BRANCH: Final = "main"
-_HALF: Final = LATTICE_CELLS // 2
-_REQUIRED_FOLDERS: Final = {"refs", "snapshots"}
-_KNOWN_FOLDERS: Final = _REQUIRED_FOLDERS | {"chunks", "manifests", "transactions", "config.yaml"}
 
 ROLLED_BACK_TO: Final = "rolled_back_to"
 """In a version's metadata: the id of the earlier one that it equals."""
@@ -92,13 +92,12 @@ class SemanticMap:
             OutputExistsError: If something is there already.
             StoreError: If the folder cannot be written.
         """
-        icechunk = _icechunk()
+        icechunk = quiet_icechunk()
         import zarr
-        from zarr.codecs import ZstdCodec
 
         if path.exists():
             raise OutputExistsError(f"{path} exists already; choose another name.")
-        with _store_errors(f"Cannot make a map at {path}"):
+        with store_errors(f"Cannot make a map at {path}"):
             path.parent.mkdir(parents=True, exist_ok=True)
             repository = icechunk.Repository.create(icechunk.local_filesystem_storage(str(path)))
             session = repository.writable_session(_BRANCH)
@@ -106,16 +105,7 @@ class SemanticMap:
             group.attrs["meta"] = meta.model_dump(mode="json")
             group.attrs["drives"] = {}
             group.attrs["num_tiles"] = 0
-            for name, dtype in LAYERS.items():
-                lead = (len(meta.label_set), meta.num_bins) if name == "counts" else ()
-                group.create_array(
-                    name,
-                    shape=(*lead, LATTICE_CELLS, LATTICE_CELLS),
-                    chunks=(*lead, TILE_CELLS, TILE_CELLS),
-                    dtype=dtype,
-                    fill_value=0,
-                    compressors=ZstdCodec(level=1, checksum=True),
-                )
+            make_arrays(group, meta)
             session.commit("Empty map")
         return cls(path, repository, meta, None)
 
@@ -126,13 +116,13 @@ class SemanticMap:
         Raises:
             StoreError: If there is no map, its schema is newer than ours, or it is damaged.
         """
-        icechunk = _icechunk()
+        icechunk = quiet_icechunk()
         import zarr
 
         if not is_semantic_map(path):
             found = "nothing" if not path.exists() else "something else"
             raise StoreError(f"No semantic map at {path} (found {found}); `hdmap build` makes one.")
-        with _store_errors(f"Cannot open the map at {path}"):
+        with store_errors(f"Cannot open the map at {path}"):
             repository = icechunk.Repository.open(icechunk.local_filesystem_storage(str(path)))
             session = (
                 repository.readonly_session(_BRANCH)
@@ -174,7 +164,7 @@ class SemanticMap:
     def tile_indices(self) -> tuple[TileIndex, ...]:
         """Indices of the tiles that hold evidence, sorted."""
         with self._reading():
-            found = _listed(self._session())
+            found = listed_tiles(self._session())
             expected = self._group().attrs["num_tiles"]
         # The store's own index of chunks carries no checksum.
         if len(found) != expected:
@@ -203,16 +193,17 @@ class SemanticMap:
         counts = CellCounts(self.meta)
         with self._reading():
             group = self._group()
-            counts.tiles = {index: _read_tile(group, index) for index in self.tile_indices()}
+            counts.tiles = {index: read_tile(group, index) for index in self.tile_indices()}
         counts.num_frames = sum(drive["num_frames"] for drive in self.drives.values())
         return counts
 
     def segments_of(self, drive_id: str) -> frozenset[int]:
         """Numbers of the parts of a drive that were added with one."""
         return frozenset(
-            version.metadata["segment"]
+            segment
             for version in self.history()
-            if "segment" in version.metadata and drive_id in version.metadata.get("drives", {})
+            if drive_id in version.metadata.get("drives", {})
+            for segment in version.metadata.get("segments", ())
         )
 
     def add(
@@ -230,8 +221,43 @@ class SemanticMap:
             MapMismatchError: If the counts are of another kind of map, or overflow.
             StoreError: If the commit fails; the map then stays as it was.
         """
-        part = {} if segment is None else {"segment": segment}
+        part = {} if segment is None else {"segments": [segment]}
         return self._apply_counts(counts, drive_id, 1, message or f"Add {drive_id}", part)
+
+    def add_by_workers(
+        self,
+        write: Callable[[Any], Iterable[Any]],
+        drive_id: str,
+        *,
+        num_frames: int,
+        segments: list[int],
+    ) -> str:
+        """Let others write tiles of (part of) a drive, and commit; returns the version's id.
+
+        Args:
+            write: Given a fork of the session, has `add_to_tile` called on it or on copies in
+                other processes, each tile in one of them, and gives all that were written to.
+            drive_id: Where it was seen.
+            num_frames: Images that the parts hold.
+            segments: Numbers of the parts.
+
+        Raises:
+            StoreError: If the commit fails; the map then stays as it was.
+        """
+        import zarr
+
+        drives = {drive_id: {"num_frames": num_frames}}
+        with self._writing() as session:
+            session.merge(*write(session.fork()))
+            group = zarr.open_group(session.store)
+            group.attrs["drives"] = _changed_drives(_drives_of(group), drives, 1)
+            group.attrs["num_tiles"] = len(listed_tiles(session))
+            listed = ", ".join(map(str, segments))
+            version: str = session.commit(
+                f"Add {drive_id}, segments {listed}",
+                metadata={"drives": drives, "sign": 1, "segments": segments},
+            )
+        return version
 
     def subtract_counts(self, counts: CellCounts, drive_id: str) -> str:
         """Take counts of a drive out and commit; returns the version's id.
@@ -259,9 +285,9 @@ class SemanticMap:
         with self._writing() as session:
             group = zarr.open_group(session.store)
             for index, tile in tiles:
-                _write_tile(group, index, tile)
+                write_tile(group, index, tile)
             group.attrs["drives"] = drives
-            group.attrs["num_tiles"] = len(_listed(session))
+            group.attrs["num_tiles"] = len(listed_tiles(session))
             version: str = session.commit(message, metadata={"drives": {}} | metadata)
         return version
 
@@ -271,7 +297,7 @@ class SemanticMap:
             group = self._group()
         for index in indices:
             with self._reading():
-                tile = _read_tile(group, index)
+                tile = read_tile(group, index)
             yield tile
 
     def merge(self, other: SemanticMap, name: str = "", *, allow_repeats: bool = False) -> str:
@@ -340,7 +366,7 @@ class SemanticMap:
             if index not in present:
                 return None
             with self._reading():
-                return _read_tile(group, index)
+                return read_tile(group, index)
 
         return read
 
@@ -370,12 +396,12 @@ class SemanticMap:
             drives = checked_drives(_drives_of(group))
             for index, tile in tiles:
                 if not tile.is_empty:
-                    held = _read_tile(group, index)
+                    held = read_tile(group, index)
                     shifted = shift_heights(tile, shift_mm)
-                    _write_tile(group, index, combine_tiles(held, shifted, sign, index))
+                    write_tile(group, index, combine_tiles(held, shifted, sign, index))
             if drives:
                 group.attrs["drives"] = _changed_drives(_drives_of(group), drives, sign)
-                group.attrs["num_tiles"] = len(_listed(session))
+                group.attrs["num_tiles"] = len(listed_tiles(session))
             if not session.has_uncommitted_changes:
                 return session.snapshot_id
             metadata = {"drives": drives, "sign": sign} | (more or {})
@@ -391,7 +417,7 @@ class SemanticMap:
             f"Could not commit to {self.path}, the map is as it was before (check free space, and that no "
             "other process writes it)"
         )
-        with _store_errors(failed):
+        with store_errors(failed):
             session = self._repository.writable_session(_BRANCH)
             try:
                 yield session
@@ -401,7 +427,7 @@ class SemanticMap:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        with _store_errors(
+        with store_errors(
             f"The map at {self.path} is damaged or cannot be read; build it anew or take a copy"
         ):
             yield
@@ -417,84 +443,6 @@ class SemanticMap:
         return zarr.open_group(self._session().store, mode="r")
 
 
-def is_semantic_map(path: Path) -> bool:
-    """Whether a folder is a map's repository and holds nothing else."""
-    if not path.is_dir():
-        return False
-    try:
-        found = {entry.name for entry in path.iterdir()}
-    except OSError:
-        return False
-    return found >= _REQUIRED_FOLDERS and found <= _KNOWN_FOLDERS
-
-
-def _icechunk() -> ModuleType:
-    """The library, told to keep its log to itself.
-
-    It warns at every local store, and on errors prints what it also raises.
-    """
-    import icechunk
-
-    icechunk.set_logs_filter("off")
-    return icechunk
-
-
-@contextmanager
-def _store_errors(what: str) -> Iterator[None]:
-    """Turn whatever the store's libraries raise into one line that starts with `what`."""
-    import icechunk
-    from zarr.errors import BaseZarrError
-
-    try:
-        yield
-    except HDMapError:
-        raise
-    except (
-        OSError,
-        KeyError,
-        ValueError,
-        TypeError,
-        RuntimeError,
-        BaseZarrError,
-        icechunk.IcechunkError,
-    ) as error:
-        raise StoreError(f"{what}: {_one_line(error)}.") from error
-
-
-def _listed(session: icechunk.Session) -> tuple[TileIndex, ...]:
-    """Tiles in a session's index; a height comes with every observation, so its chunks are the tiles."""
-    from zarr.core.sync import sync
-
-    async def listed() -> set[TileIndex]:
-        return {
-            (c[-1] - _HALF // TILE_CELLS, c[-2] - _HALF // TILE_CELLS)
-            async for c in session.chunk_coordinates("/height_n")
-        }
-
-    return tuple(sorted(sync(listed())))
-
-
-def _region(index: TileIndex) -> tuple[slice, slice]:
-    x, y = index[0] * TILE_CELLS + _HALF, index[1] * TILE_CELLS + _HALF
-    return slice(y, y + TILE_CELLS), slice(x, x + TILE_CELLS)
-
-
-def _arrays(group: zarr.Group) -> Iterator[tuple[str, Any]]:
-    for name in LAYERS:
-        yield name, group[name]
-
-
-def _read_tile(group: zarr.Group, index: TileIndex) -> Tile:
-    rows, cols = _region(index)
-    return Tile({name: array[..., rows, cols] for name, array in _arrays(group)})
-
-
-def _write_tile(group: zarr.Group, index: TileIndex, tile: Tile) -> None:
-    rows, cols = _region(index)
-    for name, array in _arrays(group):
-        array[..., rows, cols] = tile.layers[name]
-
-
 def _drives_of(group: zarr.Group) -> Drives:
     return dict(group.attrs["drives"])  # type: ignore[arg-type]
 
@@ -508,9 +456,3 @@ def _changed_drives(held: Drives, changed: Drives, sign: int) -> Drives:
         else:
             result.pop(drive_id, None)
     return result
-
-
-def _one_line(error: BaseException) -> str:
-    """The first words of a library's message, without its own decoration."""
-    first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    return first.strip().removeprefix("x ").strip().rstrip(".")[:200]

@@ -1,99 +1,282 @@
-"""Counting points by cell and channel, compiled; the plain form is in `voting`."""
+"""One frame's votes in the cells that it saw, compiled.
+
+Tests hold it equal to a plain numpy form (tests/fusion/plain_voting.py), bit for bit.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from numba import njit
 
-from hdmap_tools.types import NDArrayAny, NDArrayInt
+from hdmap_tools.fusion.voting import SHARE_QUANTA
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayInt
 
-MAX_BOX_CELLS: Final = 2**24
-"""Largest box of cells that is counted in; 64 MB of indices."""
+POINT: Final = 0
+FRAME: Final = 1
+MAJORITY: Final = 2
+SHARE: Final = 3
+MODES: Final = {"point": POINT, "frame": FRAME, "majority": MAJORITY, "share": SHARE}
 
-MAX_COUNTS: Final = 2**25
-"""Most cell and channel pairs; 128 MB of counts."""
+_A: Final = np.uint64(0x9E3779B97F4A7C15)
+_B: Final = np.uint64(0xC2B2AE3D27D4EB4F)
+_C: Final = np.uint64(0x165667B19E3779F9)
+_D: Final = np.uint64(0xBF58476D1CE4E5B9)
+_E: Final = np.uint64(0x94D049BB133111EB)
+_30: Final = np.uint64(30)
+_27: Final = np.uint64(27)
+_31: Final = np.uint64(31)
 
-
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _cells_in_box(
-    x: NDArrayInt, y: NDArrayInt, x0: int, y0: int, width: int, height: int
-) -> tuple[NDArrayAny, int]:
-    """Number of each occupied cell of the box (width, height), by x and then y; -1 elsewhere."""
-    number = np.full(width * height, -1, dtype=np.int32)
-    for i in range(len(x)):
-        number[(x[i] - x0) * height + y[i] - y0] = 0
-    count = 0
-    for i in range(len(number)):
-        if number[i] == 0:
-            number[i] = count
-            count += 1
-    return number, count
+_MAX_TILES: Final = 64
+"""More tiles than that at once are sorted by comparing: counts would take 16 MB and more."""
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _count(
-    x: NDArrayInt,
-    y: NDArrayInt,
-    channel: NDArrayInt,
-    x0: int,
-    y0: int,
-    height: int,
-    number: NDArrayAny,
-    counts: NDArrayAny,
-) -> int:
-    """Fill counts (cell, channel); gives how many are above zero."""
-    rows = 0
-    for i in range(len(x)):
-        cell = number[(x[i] - x0) * height + y[i] - y0]
-        if counts[cell, channel[i]] == 0:
-            rows += 1
-        counts[cell, channel[i]] += 1
-    return rows
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _counting_sort(keys: NDArrayInt, size: int) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt]:
+    """Order of keys 0..size - 1, the keys that occur, and where each begins (one more at the end)."""
+    first = np.zeros(size + 1, dtype=np.int64)
+    for i in range(len(keys)):
+        first[keys[i] + 1] += 1
+    num = 0
+    for k in range(size):
+        num += first[k + 1] > 0
+        first[k + 1] += first[k]
+    found, starts = np.empty(num, dtype=np.int64), np.empty(num + 1, dtype=np.int64)
+    num = 0
+    for k in range(size):
+        if first[k + 1] > first[k]:
+            found[num], starts[num] = k, first[k]
+            num += 1
+    starts[num] = len(keys)
+    order = np.empty(len(keys), dtype=np.int64)
+    for i in range(len(keys)):
+        order[first[keys[i]]] = i
+        first[keys[i]] += 1
+    return order, found, starts
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _listed(counts: NDArrayAny, rows: int) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt]:
-    """Cell, channel and number of points of each count above zero, in that order."""
-    cell = np.empty(rows, dtype=np.int64)
-    channel = np.empty(rows, dtype=np.int64)
-    points = np.empty(rows, dtype=np.int64)
-    row = 0
-    for c in range(counts.shape[0]):
-        for k in range(counts.shape[1]):
-            if counts[c, k] > 0:
-                cell[row], channel[row], points[row] = c, k, counts[c, k]
-                row += 1
-    return cell, channel, points
-
-
-def tally(
-    cells: NDArrayInt, channels: NDArrayInt
-) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt, NDArrayInt] | None:
-    """Points by cell and channel, without sorting.
+def by_tile_and_cell(
+    cells: NDArrayInt, side: int
+) -> Iterator[tuple[tuple[int, int], NDArrayInt, NDArrayInt, NDArrayInt]]:
+    """Sort points by cell, tile after tile.
 
     Args:
-        cells: (N, 2) int64 lattice cells, N at least 1.
-        channels: (N,) int64, not negative.
+        cells: (N, 2) int64 lattice cells of the points, N at least 1.
+        side: Cells a side of a tile.
 
-    Returns:
-        Occupied cells (C, 2) by x and then y; and for each cell and channel with a
-        point, by cell and then channel: index of the cell, channel, number of points.
-        None where the points are spread so widely that sorting them takes less memory.
+    Yields:
+        Tile (tx, ty), rows of its points in order of their cell, where in these each
+        occupied cell begins (K + 1,), and the cells (K,), ``y * side + x`` in the tile.
     """
-    low, high = cells.min(axis=0), cells.max(axis=0)
-    width, height = (int(n) for n in high - low + 1)
-    if width * height > MAX_BOX_CELLS:
-        return None
-    x, y = np.ascontiguousarray(cells[:, 0]), np.ascontiguousarray(cells[:, 1])
-    number, occupied = _cells_in_box(x, y, int(low[0]), int(low[1]), width, height)
-    num_channels = int(channels.max()) + 1
-    if occupied * num_channels > MAX_COUNTS:
-        return None
-    counts = np.zeros((occupied, num_channels), dtype=np.int32)
-    rows = _count(x, y, channels, int(low[0]), int(low[1]), height, number, counts)
-    cell, channel, points = _listed(counts, rows)
-    flat = np.flatnonzero(number >= 0)
-    unique_cells = np.column_stack([flat // height, flat % height]) + low
-    return unique_cells, cell, channel, points
+    tiles = cells // side
+    low = tiles.min(axis=0)
+    width, height = (int(n) for n in tiles.max(axis=0) - low + 1)
+    tile = (tiles[:, 0] - low[0]) * height + tiles[:, 1] - low[1]
+    within = cells - tiles * side
+    keys = (tile * side + within[:, 1]) * side + within[:, 0]
+    if width * height <= _MAX_TILES:
+        order, found, starts = _counting_sort(keys, width * height * side * side)
+    else:
+        order = np.argsort(keys, kind="stable")
+        found, starts = np.unique(keys[order], return_index=True)
+        starts = np.append(starts, len(keys)).astype(np.int64)
+    tile_of_cell = found // (side * side)
+    edges = np.flatnonzero(np.diff(tile_of_cell, prepend=-1, append=-1))
+    for a, b in pairwise(edges.tolist()):
+        tx, ty = divmod(int(tile_of_cell[a]), height)
+        first, last = starts[a], starts[b]
+        yield (
+            (tx + int(low[0]), ty + int(low[1])),
+            order[first:last],
+            starts[a : b + 1] - first,
+            found[a:b] % (side * side),
+        )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _hash(ix: int, iy: int, channel: int, key: np.uint64) -> np.uint64:
+    """As `voting._hash`."""
+    mixed = np.uint64(ix) * _A ^ np.uint64(iy) * _B ^ np.uint64(channel) * _C ^ key
+    mixed = (mixed ^ (mixed >> _30)) * _D
+    mixed = (mixed ^ (mixed >> _27)) * _E
+    return mixed ^ (mixed >> _31)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def vote(
+    runs: NDArrayInt,
+    starts: NDArrayInt,
+    cells: NDArrayInt,
+    corner: tuple[int, int],
+    side: int,
+    slots: NDArrayAny,
+    num_bins: int,
+    mode: int,
+    key: np.uint64,
+    height_mm: NDArrayAny,
+    intensity: NDArrayByte,
+    has_intensity: NDArrayAny,
+    sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
+    counts: NDArrayAny,
+    heights: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
+    intensities: tuple[NDArrayAny, NDArrayAny],
+) -> None:
+    """Add the votes of one frame to a tile, and sums of height and intensity.
+
+    Args:
+        runs: (R, 2) ranges of cells to look at.
+        starts: (K + 1,) first point of each cell.
+        cells: (K,) flat cell in the tile, ``y * side + x``.
+        corner: Lattice cell (ix, iy) of the tile's first.
+        side: Cells a side of the tile.
+        slots: (N,) uint16 ``1 + label * num_bins + bin`` of each point, by cell; 0: not seen.
+        num_bins: Bins of a label.
+        mode: One of `MODES`.
+        key: Names the frame; breaks ties.
+        height_mm: (N,) int32 above the map's reference.
+        intensity: (N,) uint8.
+        has_intensity: (N,) bool, or empty: all have.
+        sums: (K,) each, of all points of a cell: height, its square, intensity; or empty.
+        counts: (channels, side * side) changed, as are
+        heights: number, sum and sum of squares (side * side), and
+        intensities: number and sum.
+    """
+    num_channels = len(counts)
+    crowded = max(2 * num_channels, 16)
+    one, zero = np.uint32(1), np.uint32(0)
+    tally0, tally1 = np.zeros(num_channels + 1, np.uint32), np.zeros(num_channels + 1, np.uint32)
+    tally2, tally3 = np.zeros(num_channels + 1, np.uint32), np.zeros(num_channels + 1, np.uint32)
+    points = np.zeros(num_channels, dtype=np.int64)
+    touched = np.empty(num_channels, dtype=np.int64)
+    chance = np.empty(num_channels, dtype=np.uint64)
+    quanta = np.empty(num_channels, dtype=np.int64)
+    remainder = np.empty(num_channels, dtype=np.int64)
+    height_sums, square_sums, intensity_sums = sums
+    height_n, height_sum, height_sum_sq = heights
+    intensity_n, intensity_sum = intensities
+    has_sums, all_measured = len(height_sums) > 0, len(has_intensity) == 0
+    for r in range(len(runs)):
+        for k in range(runs[r, 0], runs[r, 1]):
+            first, last = starts[k], starts[k + 1]
+            count = last - first
+            if count == 0:
+                continue
+            here = slots[first:last]
+            num, seen = 0, np.int64(0)
+            if count >= crowded:
+                # Four tallies side by side: the next count need not wait for the last.
+                for i in range(count // 4):
+                    tally0[here[4 * i]] += one
+                    tally1[here[4 * i + 1]] += one
+                    tally2[here[4 * i + 2]] += one
+                    tally3[here[4 * i + 3]] += one
+                for i in range(count - count % 4, count):
+                    tally0[here[i]] += one
+                for slot in range(num_channels + 1):
+                    total = np.int64(tally0[slot] + tally1[slot] + tally2[slot] + tally3[slot])
+                    if total > 0:
+                        tally0[slot] = tally1[slot] = tally2[slot] = tally3[slot] = zero
+                        if slot > 0:
+                            touched[num], points[slot - 1] = slot - 1, total
+                            num += 1
+                            seen += total
+            else:
+                for i in range(count):
+                    channel = np.int64(here[i]) - 1
+                    if channel < 0:
+                        continue
+                    if points[channel] == 0:
+                        touched[num] = channel
+                        num += 1
+                    points[channel] += 1
+                    seen += 1
+            if num == 0:
+                continue
+            cell = cells[k]
+            ix, iy = corner[0] + cell % side, corner[1] + cell // side
+            if mode == 0:
+                for j in range(num):
+                    counts[touched[j], cell] += np.uint32(points[touched[j]])
+            elif num == 1:
+                counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == 3 else 1)
+            elif mode == 3:
+                left = SHARE_QUANTA
+                for j in range(num):
+                    channel = touched[j]
+                    # 32 bits divide in half the time; 2**28 points in a cell are none of ours.
+                    share = np.uint32(SHARE_QUANTA * points[channel])
+                    quanta[j] = np.int64(share // np.uint32(seen))
+                    remainder[j] = np.int64(share) - quanta[j] * seen
+                    chance[j] = _hash(ix, iy, channel, key)
+                    left -= quanta[j]
+                for _ in range(left):
+                    best = -1
+                    for j in range(num):
+                        if remainder[j] < 0:
+                            continue
+                        if (
+                            best < 0
+                            or remainder[j] > remainder[best]
+                            or (remainder[j] == remainder[best] and chance[j] < chance[best])
+                        ):
+                            best = j
+                    quanta[best] += 1
+                    remainder[best] = -1
+                for j in range(num):
+                    counts[touched[j], cell] += np.uint32(quanta[j])
+            else:
+                won, won_points, won_chance = -1, 0, np.uint64(0)
+                for j in range(num):
+                    label = touched[j] // num_bins
+                    is_first = True
+                    for i in range(j):
+                        if touched[i] // num_bins == label:
+                            is_first = False
+                    if not is_first:
+                        continue
+                    best, total = touched[j], points[touched[j]]
+                    for i in range(j + 1, num):
+                        other = touched[i]
+                        if other // num_bins != label:
+                            continue
+                        total += points[other]
+                        if points[other] > points[best] or (
+                            points[other] == points[best]
+                            and _hash(ix, iy, other, key) < _hash(ix, iy, best, key)
+                        ):
+                            best = other
+                    if mode == 1:
+                        counts[best, cell] += np.uint32(1)
+                        continue
+                    luck = _hash(ix, iy, label, key)
+                    if total > won_points or (total == won_points and luck < won_chance):
+                        won, won_points, won_chance = best, total, luck
+                if mode == 2:
+                    counts[won, cell] += np.uint32(1)
+            for j in range(num):
+                points[touched[j]] = 0
+            height_n[cell] += np.uint32(seen)
+            if has_sums and seen == count:
+                height_sum[cell] += height_sums[k]
+                height_sum_sq[cell] += square_sums[k]
+                intensity_n[cell] += np.uint32(count)
+                intensity_sum[cell] += intensity_sums[k]
+                continue
+            total_h, total_sq, total_i = np.int64(0), np.int64(0), np.int64(0)
+            measured = 0
+            for i in range(first, last):
+                if slots[i] == 0:
+                    continue
+                h = np.int64(height_mm[i])
+                total_h += h
+                total_sq += h * h
+                if all_measured or has_intensity[i]:
+                    measured += 1
+                    total_i += np.int64(intensity[i])
+            height_sum[cell] += total_h
+            height_sum_sq[cell] += np.uint64(total_sq)
+            intensity_n[cell] += np.uint32(measured)
+            intensity_sum[cell] += np.uint64(total_i)

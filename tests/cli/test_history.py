@@ -27,7 +27,7 @@ def test_versions_are_listed_compared_and_undone(made, hdmap, fails):
     assert lines[3].endswith("Empty map")
     listed = json.loads(hdmap("history", "map", "--json")[1])
     assert [v["id"] for v in listed] == [line.split()[1] for line in lines]
-    assert listed[0]["metadata"]["segment"] == 2
+    assert listed[0]["metadata"]["segments"] == [2]
 
     code, out, _ = hdmap("history", "map", "--diff", "2", "0")
     assert code == 0

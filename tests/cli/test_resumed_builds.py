@@ -86,7 +86,7 @@ def test_a_build_that_failed_goes_on_after_its_last_commit(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "number"), [("add", 1), ("add", 3), ("_write_tile", 1), ("_write_tile", 4)]
+    ("name", "number"), [("add", 1), ("add", 3), ("write_tile", 1), ("write_tile", 4)]
 )
 def test_a_build_killed_at_any_point_goes_on(street, hdmap, whole, name, number):
     program = KILLED.format(name=name, number=number, arguments=list(BUILD))

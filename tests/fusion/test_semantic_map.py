@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from hdmap_tools.errors import MapMismatchError, OutputExistsError, StoreError
-from hdmap_tools.fusion.semantic_map import SemanticMap, is_semantic_map
+from hdmap_tools.fusion.map_store import is_semantic_map
+from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.geometry.grid import BevGrid
 
 from .builders import counts_of, frames_of, meta, random_frame

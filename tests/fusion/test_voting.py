@@ -3,8 +3,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdmap_tools.fusion.vote_kernels import tally
-from hdmap_tools.fusion.voting import SHARE_QUANTA, Votes, cast_votes, tally_by_sorting
+from hdmap_tools.association.observations import Observations
+from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.voting import SHARE_QUANTA
+from hdmap_tools.labels.label_set import Label, LabelSet
+from tests.fusion.builders import meta
+from tests.fusion.plain_voting import add_plainly, cast_votes
 
 
 def votes_of(labels, mode, *, cells=None, bins=None, frame_key=0, num_bins=2):
@@ -90,35 +94,43 @@ def test_each_frame_has_the_same_weight_in_every_cell(rows):
         assert totals == dict.fromkeys(seen, weight)
 
 
+def label_set_of(size):
+    return LabelSet(
+        name=f"of-{size}",
+        labels=tuple(Label(id=k, name=f"l{k}", color=(k, 0, 0)) for k in range(size)),
+    )
+
+
 @pytest.mark.parametrize("mode", ["majority", "share", "frame", "point"])
-def test_no_points_no_votes(mode):
-    votes = cast_votes(
-        np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), num_bins=2, mode=mode, frame_key=0
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 400),
+    st.sampled_from([0.05, 0.2, 0.7]),
+    st.sampled_from([2, 5, 255]),
+    st.sampled_from(["none", "some", "all"]),
+    st.sampled_from([3.0, 60.0, 50_000.0]),
+)
+@settings(max_examples=60, deadline=None)
+def test_compiled_votes_are_the_plain_ones_bit_for_bit(
+    mode, seed, number, extent_m, num_labels, measured, away_m
+):
+    rng = np.random.default_rng(seed)
+    points = np.column_stack(
+        [rng.uniform(-extent_m, extent_m, (number, 2)) + away_m, rng.normal(3.0, 2.0, number)]
     )
-    assert isinstance(votes, Votes)
-    assert len(votes.cells) == len(votes.channels) == len(votes.quanta) == 0
-
-
-@given(points, st.integers(-(10**6), 10**6))
-@settings(max_examples=150, deadline=None)
-def test_counting_in_a_box_equals_sorting(rows, shift):
-    array = np.array(rows, dtype=np.int64).reshape(-1, 4)
-    if len(array) == 0:
-        return
-    cells, channels = array[:, :2] + shift, array[:, 2] * 2 + array[:, 3]
-    compiled = tally(cells, channels)
-    assert compiled is not None
-    for mine, plain in zip(compiled, tally_by_sorting(cells, channels), strict=True):
-        assert mine.dtype == plain.dtype
-        assert np.array_equal(mine, plain)
-
-
-def test_points_far_apart_are_sorted():
-    cells = np.array([[0, 0], [10**5, 10**5], [0, 0]], dtype=np.int64)
-    channels = np.array([1, 0, 1], dtype=np.int64)
-    assert tally(cells, channels) is None
-    votes = cast_votes(
-        cells, np.array([1, 0, 1]), np.zeros(3, int), num_bins=1, mode="point", frame_key=0
+    if away_m > 1000 and number:
+        points[0] = -points[0]  # tiles too far apart to count in a box
+    seen = Observations(
+        points,
+        rng.integers(0, num_labels, number).astype(np.uint8),
+        None if measured == "none" else rng.integers(0, 90, number).astype(np.uint8),
+        rng.random(number) < 0.7 if measured == "some" else None,
     )
-    assert votes.cells.tolist() == [[0, 0], [10**5, 10**5]]
-    assert votes.quanta.tolist() == [2, 1]
+    of_meta = meta(count_mode=mode, label_set=label_set_of(num_labels))
+    compiled, plain = CellCounts(of_meta), CellCounts(of_meta)
+    for key in (seed, 7):
+        compiled.add(seen, key)
+        add_plainly(plain, seen, key)
+    assert compiled.equals(plain)
+    assert compiled.tile_indices() == plain.tile_indices()
+    assert compiled.num_frames == plain.num_frames == 2

@@ -47,7 +47,7 @@ def test_no_part_shares_a_map_or_a_seed_with_another(recipe):
     for what in (lambda d: d.world, lambda d: d.settings["seed"]):
         seen = [value for drives in parts.values() for value in {what(d) for d in drives}]
         assert len(seen) == len(set(seen))
-    assert {d.world for d in parts["test"]} == {"mapping_example"}
+    assert {d.world for d in parts["test"]} == {"demo_town"}
 
 
 def test_every_part_has_all_weathers_difficulties_and_rigs(recipe):
@@ -131,7 +131,7 @@ def test_roadgen_makes_the_same_grid_again(recipe, tmp_path):
     assert len(world.crosswalks) > 5
 
 
-def test_another_map_is_not_taken_for_the_one_that_is_held_out(recipe, tmp_path):
+def test_another_map_is_not_taken_for_mapping_example(recipe, tmp_path):
     wrong = tmp_path / "mapping_example.osm"
     with pytest.raises(SystemExit, match="There is no map"):
         recipe.make_worlds(tmp_path, wrong)
@@ -140,7 +140,7 @@ def test_another_map_is_not_taken_for_the_one_that_is_held_out(recipe, tmp_path)
         recipe.make_worlds(tmp_path, wrong)
 
 
-def test_the_held_out_map_is_the_real_one(recipe, data_root):
+def test_mapping_example_is_the_one_of_lanelet2(recipe, data_root):
     found = recipe.sha256_of_text(data_root / "lanelet2" / "mapping_example.osm")
     assert found == recipe.MAPPING_EXAMPLE_SHA256
 

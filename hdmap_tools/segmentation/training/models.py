@@ -6,6 +6,7 @@ of the same size, also after export.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
@@ -39,6 +40,15 @@ def build_model(preset: TrainPreset, num_labels: int, pretrained: bool | None = 
             )
         return StreetNet(num_labels)
     return _deeplab(num_labels, wanted)
+
+
+def shift_scores(model: nn.Module, offsets: Sequence[float]) -> None:
+    """Add to the score of each label, in the last convolution of a network of `build_model`."""
+    last = model.scores if isinstance(model, StreetNet) else model.network.segmentation_head[0]
+    with torch.no_grad():
+        added = torch.tensor(offsets, dtype=last.bias.dtype, device=last.bias.device)
+        # Several in a row are one label's: of the pixels of a cell.
+        last.bias += added.repeat_interleave(len(last.bias) // len(added))
 
 
 def _deeplab(num_labels: int, pretrained: bool) -> nn.Module:

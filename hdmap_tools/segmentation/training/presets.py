@@ -87,6 +87,8 @@ class TrainPreset(BaseModel):
         max_gradient_norm: Longer gradients are cut to this length; None: never.
         class_weight_power: Labels are weighted in the loss by their frequency to minus
             this power; 0: alike.
+        fits_offsets: In the end, move each label's score so that the mean IoU on the
+            validation images is highest (`label_offsets`).
         validate_epochs: Validate every so many epochs, and at the end.
         validate_min_steps: But not more often than that, where an epoch is short.
         validate_images: Evenly chosen of those given, to be quick; the end is judged on all.
@@ -108,6 +110,7 @@ class TrainPreset(BaseModel):
     judges_every_second_pixel: bool = False
     overlap_weight: Annotated[float, Field(ge=0)] = 0.0
     class_weight_power: Annotated[float, Field(ge=0, le=1)] = 0.0
+    fits_offsets: bool = False
     validate_epochs: _Count = 1
     validate_min_steps: _Count = 50
     validate_images: _Count = 100
@@ -136,15 +139,17 @@ PRESETS: Final[dict[str, TrainPreset]] = {
             max_gradient_norm=1.0,
             judges_every_second_pixel=True,
             overlap_weight=0.3,
-            batch=8,
-            epochs=20,
-            class_weight_power=0.4,
+            batch=4,
+            epochs=13,
+            class_weight_power=0.3,
+            fits_offsets=True,
             # On two cores a look at sixty images takes as long as twenty steps.
             validate_epochs=3,
             validate_images=60,
             bfloat16_on_cpu=True,
             augmentation=Augmentation(
-                crop_px=480,
+                crop_px=352,
+                windows_tried=3,
                 scale=(0.7, 1.6),
                 brightness=0.25,
                 contrast=0.25,

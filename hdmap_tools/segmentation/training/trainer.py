@@ -34,7 +34,8 @@ from hdmap_tools.segmentation.training.checkpoint import (
 )
 from hdmap_tools.segmentation.training.class_weights import class_weights
 from hdmap_tools.segmentation.training.image_pairs import ImagePairs
-from hdmap_tools.segmentation.training.models import build_model
+from hdmap_tools.segmentation.training.label_offsets import fit_offsets, sampled_scores
+from hdmap_tools.segmentation.training.models import build_model, shift_scores
 from hdmap_tools.segmentation.training.overlap_loss import overlap_loss
 from hdmap_tools.segmentation.training.presets import AdamW, Sgd
 from hdmap_tools.segmentation.training.processes import Processes, joined_processes, unwrapped
@@ -44,7 +45,7 @@ from hdmap_tools.segmentation.training.validation import confusion_on, label_iou
 
 _log = logging.getLogger(__name__)
 
-_KEPT_BYTES: Final = 4 * 2**30
+_KEPT_BYTES: Final = 5 * 2**30
 """Of training images kept in memory as they were read, which takes a tenth of a small step."""
 
 _MAX_SKIPPED: Final = 5
@@ -303,9 +304,10 @@ class _Training:
         source = f"{len(chosen)} of {num} validation images of {self.val_pairs.name}"
         return ConfusionMatrix(labels, labels, processes.total(mine.counts), source)
 
-    def _keep(self, matrix: ConfusionMatrix | None) -> None:
+    def _keep(self, matrix: ConfusionMatrix | None, offsets: list[float] | None = None) -> None:
         if self.processes.is_first:
             state = {
+                "offsets": offsets,
                 "model": unwrapped(self.model).state_dict(),
                 "step": self.step,
                 "confusion": None if matrix is None else matrix.to_json(),
@@ -320,13 +322,32 @@ class _Training:
         if self.val_pairs is None:
             return
         self.step = best["step"]
+        offsets = best.get("offsets")
+        if offsets is None and self.settings.preset.fits_offsets:
+            offsets = self._fitted_offsets()
         matrix = self._validated(len(self.val_pairs))
         if self.processes.is_first:
-            self._keep(matrix)
+            self._keep(matrix, offsets)
             with atomic_output(self.run / CONFUSION_NAME, overwrite=True) as temporary:
                 temporary.write_text(matrix.to_json(), encoding="utf-8")
             said = {k: round(v, 4) for k, v in label_ious(matrix).items() if not math.isnan(v)}
             _log.info("Best at step %d: IoU %s.", self.step, json.dumps(said))
+
+    def _fitted_offsets(self) -> list[float]:
+        """Move the scores of the labels to the best mean IoU, on validation images; gives by how much."""
+        assert self.val_pairs is not None
+        preset, num = self.settings.preset, len(self.val_pairs)
+        chosen = np.unique(np.linspace(0, num - 1, min(num, preset.validate_images)).astype(int))
+        model = unwrapped(self.model)
+        # Each process finds the same.
+        scores, truth = sampled_scores(
+            model, self.val_pairs, chosen.tolist(), preset.augmentation, self.processes.device
+        )
+        offsets = [round(float(offset), 3) for offset in fit_offsets(scores, truth)]
+        shift_scores(model, offsets)
+        said = dict(zip(self.settings.label_set.names, offsets, strict=True))
+        _log.info("Scores of the labels moved by %s.", json.dumps(said))
+        return offsets
 
     def _state(self) -> dict[str, Any]:
         return {

@@ -296,3 +296,16 @@ def test_images_and_labels_that_do_not_fit_are_refused(rgb, ids) -> None:
 def test_settings_without_sense_are_refused(wrong) -> None:
     with pytest.raises(ValidationError):
         Augmentation(**wrong)
+
+
+def test_of_several_crops_the_one_with_the_most_even_mix_of_labels_is_taken():
+    rgb = np.zeros((60, 400, 3), np.uint8)
+    ids = np.zeros((60, 400), np.uint8)
+    ids[:, 300:] = np.arange(100) // 10  # ten labels at one end, one label elsewhere
+    shares = []
+    for tried in (1, 16):
+        augment = Augment(Augmentation(flip=0, scale=(1, 1), crop_px=60, windows_tried=tried))
+        labels = [len(np.unique(augment(rgb, ids, seed)[1])) for seed in range(60)]
+        shares.append(np.mean(np.array(labels) > 3))
+    assert shares[0] < 0.4
+    assert shares[1] > 0.85

@@ -1,0 +1,1 @@
+"""Builds spread over workers: segments are counted apart, tiles summed, one process commits."""

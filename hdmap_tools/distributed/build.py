@@ -1,0 +1,210 @@
+"""A build on the workers of a Dask cluster: of this machine or of many.
+
+Segments of the drive are the tasks. Their counts stay on the workers that made them; those of
+one tile are then added up and written by one worker, in a fork of the map's session, and this
+process commits. Counts are integers: the map is that of an undivided build, whoever did what,
+and however often a task had to be done again because its worker died.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final
+
+from hdmap_tools.distributed.count_segment import SegmentCounts, SegmentTask, count_segment
+from hdmap_tools.errors import ClusterError, HDMapError, MissingExtraError
+from hdmap_tools.fusion.cell_counts import TileIndex
+from hdmap_tools.fusion.map_store import add_to_tile
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.mapping import FrameCounts
+from hdmap_tools.segmentation.cache import SegmentProgress
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+_LOG = logging.getLogger(__name__)
+
+_PROGRESS: Final = "hdmap-images"
+_ANSWERS_WITHIN_S: Final = 20.0
+_AHEAD: Final = 2
+"""Segments in the queue for each worker: one at work, one that waits."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where a build is spread.
+
+    Attributes:
+        number: Processes on this machine; 0 with a scheduler.
+        scheduler: Address of a Dask scheduler that runs already, ``tcp://host:port``.
+        memory: Limit of each process on this machine, as Dask writes it (``2GB``).
+    """
+
+    number: int = 0
+    scheduler: str | None = None
+    memory: str | None = None
+
+
+@contextmanager
+def connected(workers: Workers) -> Iterator[Client]:
+    """A client of the cluster; that of this machine is started, and ended with the block.
+
+    Raises:
+        MissingExtraError: If Dask is not installed.
+        ClusterError: If there is no scheduler at the address, or it has no workers.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise MissingExtraError(
+            "Spreading a build needs Dask: pip install 'hdmap_tools[distributed]'."
+        ) from error
+    # Workers that come and go are reported as errors of the build, if they are any.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with ExitStack() as stack:
+        if workers.scheduler is None:
+            cluster = LocalCluster(
+                n_workers=workers.number,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=workers.memory or "auto",
+                dashboard_address=None,
+            )
+            yield stack.enter_context(Client(stack.enter_context(cluster)))
+            return
+        try:
+            client = stack.enter_context(Client(workers.scheduler, timeout=_ANSWERS_WITHIN_S))
+        except (OSError, TimeoutError, ValueError) as error:
+            raise ClusterError(
+                f"No Dask scheduler answers at {workers.scheduler} ({error or type(error).__name__}); "
+                "start one with `dask scheduler`, or take --workers N for processes of this machine."
+            ) from error
+        if not client.scheduler_info()["workers"]:
+            raise ClusterError(
+                f"The scheduler at {workers.scheduler} has no workers; start some with "
+                f"`dask worker {workers.scheduler}`."
+            )
+        yield client
+
+
+def add_segments(
+    client: Client,
+    task: SegmentTask,
+    drive_id: str,
+    semantic_map: SemanticMap,
+    numbers: list[int],
+    counts: FrameCounts,
+    segmented: SegmentProgress | None = None,
+) -> None:
+    """Count segments on the workers and add them to a map, a commit for those that are ready together.
+
+    Args:
+        client: Of the cluster.
+        task: How the drive is mapped.
+        drive_id: The drive.
+        semantic_map: Changed.
+        numbers: Of the segments.
+        counts: Told what went in.
+        segmented: Told of images done, of all workers together.
+
+    Raises:
+        ClusterError: If workers died again and again.
+        HDMapError: Whatever a worker raised.
+    """
+    from distributed import wait
+
+    heard = count(counts.used + 1)
+
+    def hear(_: Any) -> None:
+        if segmented is not None:
+            segmented(next(heard), task.num_images)
+
+    client.subscribe_topic(_PROGRESS, hear)
+    waiting, counting = list(numbers), set[Any]()
+    try:
+        while waiting or counting:
+            room = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
+            while waiting and len(counting) < room:
+                counting.add(client.submit(_count, task, waiting.pop(0), pure=False))
+            wait(counting, return_when="FIRST_COMPLETED")
+            ready = [future for future in counting if future.done()]
+            counting.difference_update(ready)
+            outlines = client.gather([client.submit(_outline, future) for future in ready])
+            _write(client, semantic_map, drive_id, ready, outlines)
+            for outline in outlines:
+                counts.used += outline.num_frames
+                counts.observations.update(outline.observations)
+    except HDMapError:
+        raise
+    except Exception as error:
+        from distributed.scheduler import KilledWorker
+
+        if isinstance(error, KilledWorker):
+            raise ClusterError(
+                "Workers died again and again on one part of the drive; most often they run out of "
+                "memory: give each more, or take fewer (--workers). What was committed is kept, and the "
+                "same command goes on from there."
+            ) from error
+        raise
+    finally:
+        client.unsubscribe_topic(_PROGRESS)
+
+
+@dataclass(frozen=True)
+class _Outline:
+    number: int
+    num_frames: int
+    observations: dict[str, int]
+    tiles: tuple[TileIndex, ...]
+
+
+def _count(task: SegmentTask, number: int) -> SegmentCounts:
+    from distributed import get_worker
+
+    return count_segment(task, number, partial(get_worker().log_event, _PROGRESS, 1))
+
+
+def _outline(counts: SegmentCounts) -> _Outline:
+    return _Outline(counts.number, counts.num_frames, counts.observations, tuple(counts.tiles))
+
+
+def _write(
+    client: Client,
+    semantic_map: SemanticMap,
+    drive_id: str,
+    ready: list[Future],
+    outlines: list[_Outline],
+) -> None:
+    """Add up the tiles of finished segments, each on one worker, and commit."""
+    holders: dict[TileIndex, list[Future]] = {}
+    for future, outline in zip(ready, outlines, strict=True):
+        for index in outline.tiles:
+            holders.setdefault(index, []).append(future)
+
+    def write(fork: Any) -> list[Any]:
+        tasks = [
+            client.submit(_add_tile, fork, index, *[client.submit(_tile, f, index) for f in parts])
+            for index, parts in sorted(holders.items())
+        ]
+        return list(client.gather(tasks))
+
+    semantic_map.add_by_workers(
+        write,
+        drive_id,
+        num_frames=sum(outline.num_frames for outline in outlines),
+        segments=sorted(outline.number for outline in outlines),
+    )
+
+
+def _tile(counts: SegmentCounts, index: TileIndex) -> Any:
+    return counts.tiles[index]
+
+
+def _add_tile(fork: Any, index: TileIndex, *parts: Any) -> Any:
+    add_to_tile(fork, index, parts)
+    return fork

@@ -1,0 +1,179 @@
+"""Point maps as the dense engine reads them: blocks of map cells, points sorted by cell.
+
+A block holds all points of its cells, so each frame's vote in a cell is cast in one place,
+whatever the sizes of the point map's tiles and of the cells.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from hdmap_tools.fusion.cell_counts import TILE_CELLS, TileIndex, heights_in_mm
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.geometry.grid import cells_of
+from hdmap_tools.point_map.point_map import PointMap
+from hdmap_tools.point_map.values import MapPoints
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
+
+BLOCK_CELLS: Final = TILE_CELLS // 2
+"""Cells a side of a block; tiles hold whole blocks."""
+
+BlockIndex = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class SortedPoints:
+    """Points of a block in order of their cell, rows (along y) first.
+
+    Attributes:
+        x, y, z: (N,) float32 metres from the block's corner.
+        starts: (K + 1,) first point of each occupied cell.
+        cells: (K,) flat cell in the map's tile, ``y * TILE_CELLS + x``.
+        columns: (K,) column of the cell in the block.
+        row_starts: (BLOCK_CELLS + 1,) first occupied cell of each row.
+        z_range: Lowest and highest, metres from the corner.
+    """
+
+    x: NDArrayFloat32
+    y: NDArrayFloat32
+    z: NDArrayFloat32
+    starts: NDArrayInt
+    cells: NDArrayInt
+    columns: NDArrayInt
+    row_starts: NDArrayInt
+    z_range: tuple[float, float]
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def sums_of(self, values: NDArrayAny) -> NDArrayAny:
+        """Sum (K,) of values (N,) in each cell."""
+        return np.add.reduceat(values, self.starts[:-1]) if len(values) else values
+
+    @classmethod
+    def from_points(
+        cls, points_m: NDArrayFloat, cells: NDArrayInt, index: BlockIndex
+    ) -> tuple[SortedPoints, NDArrayInt]:
+        """Sort points (N, 3), metres from the block's corner, by their lattice cells (N, 2); and the order."""
+        within = cells - np.array(index) * BLOCK_CELLS
+        flat = within[:, 1] * BLOCK_CELLS + within[:, 0]
+        order = np.argsort(flat, kind="stable")
+        occupied, starts = np.unique(flat[order], return_index=True)
+        rows, columns = np.divmod(occupied, BLOCK_CELLS)
+        in_tile = np.array(index) % (TILE_CELLS // BLOCK_CELLS) * BLOCK_CELLS
+        x, y, z = (np.ascontiguousarray(c, dtype=np.float32) for c in points_m[order].T)
+        return cls(
+            x,
+            y,
+            z,
+            np.append(starts, len(flat)).astype(np.int64),
+            (rows + in_tile[1]) * TILE_CELLS + columns + in_tile[0],
+            columns,
+            np.searchsorted(rows, np.arange(BLOCK_CELLS + 1)),
+            (float(z.min()), float(z.max())) if len(z) else (0.0, 0.0),
+        ), order
+
+
+@dataclass(frozen=True, eq=False)
+class PointBlock:
+    """All points of the cells of a block.
+
+    Attributes:
+        tile: Of the semantic map, that holds the block.
+        corner_city: (3,) south-west corner, metres, at a height near the points.
+        ground: Points that are labelled.
+        bins: (N,) uint16 intensity bin of each, 0 or 1,
+        intensity: (N,) uint8, and
+        height_mm: (N,) int32 above the map's reference.
+        sums: (K,) each, by cell: height, its square, intensity.
+        standing: Points that hide others.
+    """
+
+    tile: TileIndex
+    corner_city: NDArrayFloat
+    ground: SortedPoints
+    bins: NDArrayAny
+    intensity: NDArrayByte
+    height_mm: NDArrayAny
+    sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny]
+    standing: SortedPoints
+
+    @classmethod
+    def from_points(cls, index: BlockIndex, points: MapPoints, meta: MapMeta) -> PointBlock:
+        """Take the points of a block out of those of a place."""
+        cells = cells_of(points.points_city, meta.resolution_m)
+        inside = np.flatnonzero((cells // BLOCK_CELLS == np.array(index)).all(axis=1))
+        cells = cells[inside]
+        city, is_ground = points.points_city[inside], points.is_ground[inside]
+        edge_m = BLOCK_CELLS * meta.resolution_m
+        level = round(float(np.median(city[:, 2])), 3) if len(city) else 0.0
+        corner = np.array([index[0] * edge_m, index[1] * edge_m, level])
+        ground, order = SortedPoints.from_points(city[is_ground] - corner, cells[is_ground], index)
+        standing, _ = SortedPoints.from_points(city[~is_ground] - corner, cells[~is_ground], index)
+        intensity = points.intensity[inside][is_ground][order]
+        height_mm = heights_in_mm(city[is_ground][order, 2], meta)
+        height = height_mm.astype(np.int64)
+        sums = (
+            ground.sums_of(height),
+            ground.sums_of((height**2).astype(np.uint64)),
+            ground.sums_of(intensity.astype(np.uint64)),
+        )
+        of_tile = TILE_CELLS // BLOCK_CELLS
+        return cls(
+            (index[0] // of_tile, index[1] // of_tile),
+            corner,
+            ground,
+            (intensity >= meta.intensity_threshold).astype(np.uint16),
+            intensity,
+            height_mm,
+            sums,
+            standing,
+        )
+
+    def __len__(self) -> int:
+        return len(self.ground) + len(self.standing)
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that it takes, roughly."""
+        return 27 * len(self.ground) + 12 * len(self.standing) + 48 * len(self.ground.cells)
+
+
+class PointBlocks:
+    """The blocks of a point map, made when they are asked for; those used last are kept.
+
+    Args:
+        points: The map on disk.
+        meta: Of the semantic map whose cells they are.
+        max_bytes: Of blocks in memory.
+    """
+
+    def __init__(self, points: PointMap, meta: MapMeta, max_bytes: int = 256 * 2**20) -> None:
+        self._points, self._meta, self._max_bytes = points, meta, max_bytes
+        self._kept: OrderedDict[BlockIndex, PointBlock] = OrderedDict()
+        self._num_bytes = 0
+
+    def block(self, index: BlockIndex) -> PointBlock:
+        """One block, without points where the map has none."""
+        found = self._kept.pop(index, None)
+        if found is None:
+            edge_m = BLOCK_CELLS * self._meta.resolution_m
+            x0, y0 = index[0] * edge_m, index[1] * edge_m
+            points = self._points.points_in((x0, y0, x0 + edge_m, y0 + edge_m))
+            found = PointBlock.from_points(index, points, self._meta)
+            self._num_bytes += found.num_bytes
+        self._kept[index] = found
+        while self._num_bytes > self._max_bytes and len(self._kept) > 1:
+            _, oldest = self._kept.popitem(last=False)
+            self._num_bytes -= oldest.num_bytes
+        return found
+
+    def within(self, bounds_m: tuple[float, float, float, float]) -> list[BlockIndex]:
+        """Blocks that (x0, y0, x1, y1), city metres, touches."""
+        edge_m = BLOCK_CELLS * self._meta.resolution_m
+        x0, y0, x1, y1 = (int(np.floor(v / edge_m)) for v in bounds_m)
+        return [(x, y) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)]
