@@ -14,7 +14,7 @@ from numba import njit
 
 from hdmap_tools.types import NDArrayAny, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
-_SLACK: Final = 1e-3
+_SLACK: Final = 3e-3
 """Metres by which culling errs towards more: the float32 tests of each point decide."""
 _ZERO: Final = np.float32(0.0)
 _HALF: Final = np.float32(0.5)
@@ -74,8 +74,8 @@ def rows_in_view(
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _project(
-    xs: NDArrayFloat32,
-    ys: NDArrayFloat32,
+    xs: NDArrayAny,
+    ys: NDArrayAny,
     zs: NDArrayFloat32,
     view: NDArrayFloat32,
     width: int,
@@ -88,8 +88,8 @@ def _project(
 
     Args:
         xs: With
-        ys: and
-        zs: (N,) in the block's frame.
+        ys: (N,) int16 and
+        zs: (N,) float32 millimetres in the block's frame.
         view: (36,) as `dense_fusion.FrameView` fills it.
         width: With
         height: of the image.
@@ -109,7 +109,7 @@ def _project(
     right, below = np.float32(width), np.float32(height)
     none = np.int32(width * height)
     for i in range(len(xs)):
-        x, y, z = xs[i], ys[i], zs[i]
+        x, y, z = np.float32(xs[i]), np.float32(ys[i]), zs[i]
         ex = e00 * x + e01 * y + e02 * z + e03
         ey = e10 * x + e11 * y + e12 * z + e13
         d = c20 * x + c21 * y + c22 * z + c23
@@ -138,8 +138,8 @@ def _project(
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def see_block(
-    x: NDArrayFloat32,
-    y: NDArrayFloat32,
+    x: NDArrayAny,
+    y: NDArrayAny,
     z: NDArrayFloat32,
     bins: NDArrayAny,
     starts: NDArrayInt,
@@ -157,9 +157,9 @@ def see_block(
 
     Args:
         x: With
-        y: and
-        z: (N,) of the block, by cell.
-        bins: (N,) uint16 intensity bin.
+        y: (N,) int16 and
+        z: (N,) float32 millimetres in the block's frame, by cell.
+        bins: (N,) uint8 intensity bin.
         starts: (K + 1,) first point of each cell.
         runs: (R, 2) ranges of cells.
         view: See `_project`.
@@ -187,7 +187,7 @@ def see_block(
             if not tested:
                 for i in range(len(xs)):
                     slot = slot_of[labels[np.uint32(pixel[i])]]
-                    slot = slot + own[i] if slot > 0 else np.uint16(0)
+                    slot = slot + np.uint16(own[i]) if slot > 0 else np.uint16(0)
                     found[i] = slot
                     seen += slot > 0
                 continue
@@ -200,7 +200,7 @@ def see_block(
                     if depth[i] > hides_from_m[row // px, column // px]:
                         slot = np.uint16(0)
                     else:
-                        slot = slot + own[i]
+                        slot = slot + np.uint16(own[i])
                         seen += 1
                 found[i] = slot
     return int(seen)
@@ -208,8 +208,8 @@ def see_block(
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def lay_block(
-    x: NDArrayFloat32,
-    y: NDArrayFloat32,
+    x: NDArrayAny,
+    y: NDArrayAny,
     z: NDArrayFloat32,
     starts: NDArrayInt,
     runs: NDArrayInt,

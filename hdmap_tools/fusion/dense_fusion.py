@@ -235,6 +235,7 @@ class FrameView:
         """The same for positions that count from a place."""
         rows, planes = self.rows.copy(), self.planes.copy()
         rows[:, 3] += rows[:, :3] @ corner_city
+        rows[:, :3] /= 1000.0  # points of blocks are in millimetres
         planes[:, 3] += planes[:, :3] @ corner_city
         with np.errstate(over="ignore"):  # the radius of a pinhole is infinite
             numbers = np.concatenate([rows.ravel(), self.lens]).astype(np.float32)
@@ -246,8 +247,8 @@ class BlockView:
     """A camera's view of a block.
 
     Attributes:
-        numbers: (36,) float32, rows and lens of `FrameView`.
-        planes: (P, 4) half spaces in the block's frame.
+        numbers: (36,) float32, rows (from millimetres to metres) and lens of `FrameView`.
+        planes: (P, 4) half spaces in the block's frame, metres.
     """
 
     numbers: NDArrayFloat32
@@ -256,6 +257,6 @@ class BlockView:
     def runs(self, points: SortedPoints, resolution_m: float) -> NDArrayInt:
         """(R, 2) ranges of cells that may be seen."""
         found: NDArrayInt = rows_in_view(
-            self.planes, points.z_range, resolution_m, points.row_starts, points.columns
+            self.planes, points.z_range_m, resolution_m, points.row_starts, points.columns
         )
         return found

@@ -19,10 +19,18 @@ from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.point_map.values import MapPoints
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
-BLOCK_CELLS: Final = TILE_CELLS // 2
-"""Cells a side of a block; tiles hold whole blocks."""
+_MAX_BLOCK_MM: Final = 32_000
+"""Positions in a block are 16-bit millimetres: half the bytes to read for each point."""
 
 BlockIndex = tuple[int, int]
+
+
+def block_cells(resolution_m: float) -> int:
+    """Cells a side of a block; tiles hold whole blocks."""
+    cells = TILE_CELLS // 2
+    while cells > 1 and cells * resolution_m * 1000.0 > _MAX_BLOCK_MM:
+        cells //= 2
+    return cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,22 +38,23 @@ class SortedPoints:
     """Points of a block in order of their cell, rows (along y) first.
 
     Attributes:
-        x, y, z: (N,) float32 metres from the block's corner.
+        x, y: (N,) int16 millimetres from the block's corner.
+        z: (N,) float32 millimetres from its height.
         starts: (K + 1,) first point of each occupied cell.
         cells: (K,) flat cell in the map's tile, ``y * TILE_CELLS + x``.
         columns: (K,) column of the cell in the block.
-        row_starts: (BLOCK_CELLS + 1,) first occupied cell of each row.
-        z_range: Lowest and highest, metres from the corner.
+        row_starts: (rows + 1,) first occupied cell of each row.
+        z_range_m: Lowest and highest, metres.
     """
 
-    x: NDArrayFloat32
-    y: NDArrayFloat32
+    x: NDArrayAny
+    y: NDArrayAny
     z: NDArrayFloat32
     starts: NDArrayInt
     cells: NDArrayInt
     columns: NDArrayInt
     row_starts: NDArrayInt
-    z_range: tuple[float, float]
+    z_range_m: tuple[float, float]
 
     def __len__(self) -> int:
         return len(self.x)
@@ -56,25 +65,33 @@ class SortedPoints:
 
     @classmethod
     def from_points(
-        cls, points_m: NDArrayFloat, cells: NDArrayInt, index: BlockIndex
+        cls, points_mm: NDArrayInt, cells: NDArrayInt, index: BlockIndex, side: int
     ) -> tuple[SortedPoints, NDArrayInt]:
-        """Sort points (N, 3), metres from the block's corner, by their lattice cells (N, 2); and the order."""
-        within = cells - np.array(index) * BLOCK_CELLS
-        flat = within[:, 1] * BLOCK_CELLS + within[:, 0]
+        """Sort points (N, 3), from the block's corner, by their lattice cells (N, 2); and the order.
+
+        Args:
+            points_mm: Whole millimetres.
+            cells: All of the block.
+            index: Of the block.
+            side: Its cells a side.
+        """
+        within = cells - np.array(index) * side
+        flat = within[:, 1] * side + within[:, 0]
         order = np.argsort(flat, kind="stable")
         occupied, starts = np.unique(flat[order], return_index=True)
-        rows, columns = np.divmod(occupied, BLOCK_CELLS)
-        in_tile = np.array(index) % (TILE_CELLS // BLOCK_CELLS) * BLOCK_CELLS
-        x, y, z = (np.ascontiguousarray(c, dtype=np.float32) for c in points_m[order].T)
+        rows, columns = np.divmod(occupied, side)
+        in_tile = np.array(index) % (TILE_CELLS // side) * side
+        x, y, z = points_mm[order].T
+        heights = (float(z.min()) / 1000.0, float(z.max()) / 1000.0) if len(z) else (0.0, 0.0)
         return cls(
-            x,
-            y,
-            z,
+            np.ascontiguousarray(x, dtype=np.int16),
+            np.ascontiguousarray(y, dtype=np.int16),
+            np.ascontiguousarray(z, dtype=np.float32),
             np.append(starts, len(flat)).astype(np.int64),
             (rows + in_tile[1]) * TILE_CELLS + columns + in_tile[0],
             columns,
-            np.searchsorted(rows, np.arange(BLOCK_CELLS + 1)),
-            (float(z.min()), float(z.max())) if len(z) else (0.0, 0.0),
+            np.searchsorted(rows, np.arange(side + 1)),
+            heights,
         ), order
 
 
@@ -84,9 +101,10 @@ class PointBlock:
 
     Attributes:
         tile: Of the semantic map, that holds the block.
-        corner_city: (3,) south-west corner, metres, at a height near the points.
+        corner_city: (3,) south-west corner, whole millimetres given in metres, at a height near
+            the points.
         ground: Points that are labelled.
-        bins: (N,) uint16 intensity bin of each, 0 or 1,
+        bins: (N,) uint8 intensity bin of each, 0 or 1,
         intensity: (N,) uint8, and
         height_mm: (N,) int32 above the map's reference.
         sums: (K,) each, by cell: height, its square, intensity.
@@ -105,15 +123,18 @@ class PointBlock:
     @classmethod
     def from_points(cls, index: BlockIndex, points: MapPoints, meta: MapMeta) -> PointBlock:
         """Take the points of a block out of those of a place."""
+        side = block_cells(meta.resolution_m)
         cells = cells_of(points.points_city, meta.resolution_m)
-        inside = np.flatnonzero((cells // BLOCK_CELLS == np.array(index)).all(axis=1))
+        inside = np.flatnonzero((cells // side == np.array(index)).all(axis=1))
         cells = cells[inside]
         city, is_ground = points.points_city[inside], points.is_ground[inside]
-        edge_m = BLOCK_CELLS * meta.resolution_m
-        level = round(float(np.median(city[:, 2])), 3) if len(city) else 0.0
-        corner = np.array([index[0] * edge_m, index[1] * edge_m, level])
-        ground, order = SortedPoints.from_points(city[is_ground] - corner, cells[is_ground], index)
-        standing, _ = SortedPoints.from_points(city[~is_ground] - corner, cells[~is_ground], index)
+        city_mm = np.rint(city * 1000.0).astype(np.int64)
+        edge_mm = side * meta.resolution_m * 1000.0
+        level_mm = int(np.median(city_mm[:, 2])) if len(city) else 0
+        corner_mm = np.array([*np.floor(np.array(index) * edge_mm), level_mm], dtype=np.int64)
+        local_mm = city_mm - corner_mm
+        ground, order = SortedPoints.from_points(local_mm[is_ground], cells[is_ground], index, side)
+        standing, _ = SortedPoints.from_points(local_mm[~is_ground], cells[~is_ground], index, side)
         intensity = points.intensity[inside][is_ground][order]
         height_mm = heights_in_mm(city[is_ground][order, 2], meta)
         height = height_mm.astype(np.int64)
@@ -122,12 +143,12 @@ class PointBlock:
             ground.sums_of((height**2).astype(np.uint64)),
             ground.sums_of(intensity.astype(np.uint64)),
         )
-        of_tile = TILE_CELLS // BLOCK_CELLS
+        of_tile = TILE_CELLS // side
         return cls(
             (index[0] // of_tile, index[1] // of_tile),
-            corner,
+            corner_mm / 1000.0,
             ground,
-            (intensity >= meta.intensity_threshold).astype(np.uint16),
+            (intensity >= meta.intensity_threshold).astype(np.uint8),
             intensity,
             height_mm,
             sums,
@@ -140,7 +161,7 @@ class PointBlock:
     @property
     def num_bytes(self) -> int:
         """Memory that it takes, roughly."""
-        return 27 * len(self.ground) + 12 * len(self.standing) + 48 * len(self.ground.cells)
+        return 15 * len(self.ground) + 8 * len(self.standing) + 48 * len(self.ground.cells)
 
 
 class PointBlocks:
@@ -161,7 +182,7 @@ class PointBlocks:
         """One block, without points where the map has none."""
         found = self._kept.pop(index, None)
         if found is None:
-            edge_m = BLOCK_CELLS * self._meta.resolution_m
+            edge_m = block_cells(self._meta.resolution_m) * self._meta.resolution_m
             x0, y0 = index[0] * edge_m, index[1] * edge_m
             points = self._points.points_in((x0, y0, x0 + edge_m, y0 + edge_m))
             found = PointBlock.from_points(index, points, self._meta)
@@ -174,6 +195,6 @@ class PointBlocks:
 
     def within(self, bounds_m: tuple[float, float, float, float]) -> list[BlockIndex]:
         """Blocks that (x0, y0, x1, y1), city metres, touches."""
-        edge_m = BLOCK_CELLS * self._meta.resolution_m
+        edge_m = block_cells(self._meta.resolution_m) * self._meta.resolution_m
         x0, y0, x1, y1 = (int(np.floor(v / edge_m)) for v in bounds_m)
         return [(x, y) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)]

@@ -41,7 +41,7 @@ BOX_CELLS = 256
 
 
 class Place:
-    """A million points of ground, all in the clip, two walls, and the paint's share of bright ones."""
+    """A million points of ground, all in the clip, two walls, and bright lines of paint."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(1)
@@ -60,7 +60,8 @@ class Place:
                 rng.uniform(0.3, 3.0, num_standing),
             ]
         )
-        bright = rng.random(NUM_IN_CLIP + num_standing) < 0.05
+        across = np.concatenate([ground, wall])[:, 1]
+        bright = np.abs(across - np.round(across / 3.5) * 3.5) < 0.08  # a line every 3.5 m
         self.points = MapPoints(
             np.round(POSE.transform_from(np.concatenate([ground, wall])), 3),
             np.where(bright, 80, 20).astype(np.uint8),

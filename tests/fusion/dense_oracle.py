@@ -11,7 +11,7 @@ from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, depth_shape, widened
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.dense_fusion import FrameView, slots_of
-from hdmap_tools.fusion.point_blocks import BLOCK_CELLS, PointBlock
+from hdmap_tools.fusion.point_blocks import PointBlock, block_cells
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.grid import cells_of
 from hdmap_tools.point_map.values import MapPoints
@@ -63,16 +63,18 @@ def project_plainly(local, view, camera: PinholeCamera):
 def fuse_plainly(counts: CellCounts, points: MapPoints, labels, camera, pose, key, config) -> int:
     """What `DenseFusion.add` does, without a live sweep."""
     meta = counts.meta
-    blocks = np.unique(cells_of(points.points_city, meta.resolution_m) // BLOCK_CELLS, axis=0)
+    side = block_cells(meta.resolution_m)
+    blocks = np.unique(cells_of(points.points_city, meta.resolution_m) // side, axis=0)
     buffer = np.full(depth_shape(camera), np.inf, dtype=np.float32)
     ground = []
     for index in map(tuple, blocks.tolist()):
-        inside = (
-            cells_of(points.points_city, meta.resolution_m) // BLOCK_CELLS == np.array(index)
-        ).all(axis=1)
+        inside = (cells_of(points.points_city, meta.resolution_m) // side == np.array(index)).all(
+            axis=1
+        )
         block = PointBlock.from_points(index, points, meta)
         view = FrameView.of(camera, pose, config).from_block(block.corner_city)
-        local = (points.points_city[inside] - block.corner_city).astype(np.float32)
+        local_m = points.points_city[inside] - block.corner_city
+        local = np.rint(1000.0 * local_m).astype(np.float32)
         pixel, ok, is_far, depth = project_plainly(local, view, camera)
         is_ground = points.is_ground[inside]
         hides = ok & ~is_ground & (depth > NEAREST_M)
