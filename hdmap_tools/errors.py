@@ -22,6 +22,7 @@
     ├── WorldError (ValueError)               a map that no vehicle can be simulated on
     ├── PointMapError (ValueError)            a point map cannot be made or used
     ├── CheckpointError (ValueError)          a training run cannot be continued or exported
+    ├── ClusterError (RuntimeError)           workers cannot be reached, or die
     ├── OutputExistsError (FileExistsError)   would overwrite
     └── MissingExtraError (ImportError)       an optional dependency is not installed
 

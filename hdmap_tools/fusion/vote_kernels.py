@@ -204,7 +204,9 @@ def vote(
             if num == 0:
                 continue
             cell = cells[k]
-            ix, iy = corner[0] + cell % side, corner[1] + cell // side
+            ix = iy = 0
+            if num > 1:  # only then may there be a tie; a division takes as long as many points
+                ix, iy = corner[0] + cell % side, corner[1] + cell // side
             if mode == 0:
                 for j in range(num):
                     counts[touched[j], cell] += np.uint32(points[touched[j]])

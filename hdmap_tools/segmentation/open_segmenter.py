@@ -264,6 +264,12 @@ def find_model(drive_root: Path) -> Path:
         else ""
     )
     if is_shipped(STREET_SMALL):
+        if not (root / "truth").is_dir():  # which lies with simulated drives
+            _log.warning(
+                "No network is given, so %s is used, which has seen simulated images only and labels "
+                "recorded ones badly; take one that has seen such with --model, or --labels.",
+                STREET_SMALL,
+            )
         if others:
             _log.warning("%s is used.%s", STREET_SMALL, others)
         return Path(STREET_SMALL)

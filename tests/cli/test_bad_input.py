@@ -252,10 +252,6 @@ def test_images_without_a_sweep(street, fails):
     fails(*RUN, says=("no image has a lidar sweep", "planar"))
 
 
-def test_no_model_and_no_labels(street, fails):
-    fails("run", "drive", "-o", "out", says=("--model", "--labels"))
-
-
 def test_a_camera_that_is_not_there(street, fails):
     fails(*RUN, "--camera", "CAM_SIDEWAYS", says=("CAM_SIDEWAYS", "FRONT"))
 

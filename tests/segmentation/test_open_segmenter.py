@@ -238,6 +238,7 @@ def test_the_shipped_network_is_used_where_none_lies_with_the_drive(
     shutil.copy(speaking, networks / "street-small.onnx")
     assert open_segmenter(SegmentationConfig(model=Path("street-small")), drive).name == "speaking"
     assert find_model(drive.root) == Path("street-small")
+    assert "has seen simulated images only" in caplog.text
     with caplog.at_level(logging.INFO):
         assert open_segmenter(SegmentationConfig(), drive).name == "speaking"
     assert "Using the model street-small" in caplog.text

@@ -10,6 +10,11 @@ import numpy as np
 import pytest
 
 from hdmap_tools.readers.av2 import read_av2
+from hdmap_tools.segmentation.known_confusion import confusion_of
+from hdmap_tools.segmentation.measure_confusion import measure_confusion
+from hdmap_tools.segmentation.open_segmenter import open_model
+from hdmap_tools.segmentation.shipped import shipped_network
+from hdmap_tools.segmentation.training.pairs import open_drives, relabelled
 from hdmap_tools.simulate.read_world import read_world
 from hdmap_tools.simulate.settings import SimulationSettings
 
@@ -78,6 +83,31 @@ def test_what_ships_says_the_very_recipe(recipe, scripted):
         assert data[part]["drives"] == len(own)
         assert data[part]["worlds"] == sorted({d.world for d in own})
         assert data[part]["weather"] == dict(Counter(d.settings["weather"] for d in own))
+
+
+def test_the_file_is_the_one_that_was_measured(recipe):
+    measured = json.loads(SHIPPED.read_text())["measured"]
+    network = shipped_network("street-small")
+    assert recipe.sha256(network) == measured["model"]["sha256"]
+    assert network.stat().st_size == measured["model"]["bytes"] <= 5_000_000
+    assert measured["iou"]["all"]["lane marking"] >= 0.65
+    assert measured["iou"]["all"]["crosswalk"] >= 0.70
+
+
+def test_it_labels_a_simulated_street(recipe, simulated_drive):
+    segmenter = open_model(shipped_network("street-small"), None, {}, threads=2)
+    assert segmenter.label_set.name == "street"
+    assert confusion_of(segmenter) is not None
+    pairs = relabelled(open_drives([simulated_drive]), "street")
+    counts = sum(
+        measure_confusion(
+            [pairs.read(k)], segmenter.segment_rgb, pairs.label_set, segmenter.label_set, ""
+        ).counts
+        for k in range(len(pairs))
+    )
+    found = recipe.ious(counts, segmenter.label_set.names)
+    assert found["road"] > 0.9
+    assert found["sky"] > 0.9
 
 
 def test_the_towns_are_those_that_the_network_saw(recipe, scripted, tmp_path):
