@@ -323,9 +323,9 @@ class _Training:
             return
         self.step = best["step"]
         offsets = best.get("offsets")
-        if offsets is None and self.settings.preset.fits_offsets:
-            offsets = self._fitted_offsets()
         matrix = self._validated(len(self.val_pairs))
+        if offsets is None and self.settings.preset.fits_offsets:
+            offsets, matrix = self._with_offsets(matrix)
         if self.processes.is_first:
             self._keep(matrix, offsets)
             with atomic_output(self.run / CONFUSION_NAME, overwrite=True) as temporary:
@@ -333,8 +333,15 @@ class _Training:
             said = {k: round(v, 4) for k, v in label_ious(matrix).items() if not math.isnan(v)}
             _log.info("Best at step %d: IoU %s.", self.step, json.dumps(said))
 
-    def _fitted_offsets(self) -> list[float]:
-        """Move the scores of the labels to the best mean IoU, on validation images; gives by how much."""
+    def _with_offsets(self, before: ConfusionMatrix) -> tuple[list[float], ConfusionMatrix]:
+        """Move the scores of the labels to the best mean IoU on validation images.
+
+        Args:
+            before: What the network does as it is, on all of them.
+
+        Returns:
+            By how much, and what it does then; all 0 and as before where that is no better.
+        """
         assert self.val_pairs is not None
         preset, num = self.settings.preset, len(self.val_pairs)
         chosen = np.unique(np.linspace(0, num - 1, min(num, preset.validate_images)).astype(int))
@@ -344,10 +351,16 @@ class _Training:
             model, self.val_pairs, chosen.tolist(), preset.augmentation, self.processes.device
         )
         offsets = [round(float(offset), 3) for offset in fit_offsets(scores, truth)]
+        weights = {k: v.clone() for k, v in model.state_dict().items()}
         shift_scores(model, offsets)
+        after = self._validated(num)
+        # They were found on few pixels; all of them have the last word.
+        if mean_iou(after) <= mean_iou(before):
+            model.load_state_dict(weights)
+            return [0.0] * len(offsets), before
         said = dict(zip(self.settings.label_set.names, offsets, strict=True))
         _log.info("Scores of the labels moved by %s.", json.dumps(said))
-        return offsets
+        return offsets, after
 
     def _state(self) -> dict[str, Any]:
         return {

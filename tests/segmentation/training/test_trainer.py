@@ -66,7 +66,8 @@ def test_it_learns_the_toy_world(tmp_path, toy_pairs, toy_run_settings):
     assert ConfusionMatrix.from_json(best["confusion"]) == confusion
     rows = read_log(tmp_path / "run")
     assert [int(row["step"]) for row in rows] == [row["step"] for row in told]
-    assert max(float(row["miou"]) for row in rows) == pytest.approx(mean_iou(confusion), abs=1e-5)
+    # Moving the scores of the labels in the end may only help.
+    assert mean_iou(confusion) >= max(float(row["miou"]) for row in rows) - 1e-5
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_others(
