@@ -21,6 +21,7 @@ from hdmap_tools.errors import HDMapError
 from hdmap_tools.live import LiveMapper
 from hdmap_tools.mapping import frame_key
 from hdmap_tools.opening import open_for
+from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.view.canvas import write_png
 from hdmap_tools.view.local_and_global import local_panel
@@ -53,7 +54,13 @@ def replay(given: argparse.Namespace) -> None:
     )
     drive = open_for(config, given.drive)
     segmenter = open_segmenter(config.segmentation, drive)
-    mapper = LiveMapper(drive.cameras, segmenter.label_set, model=segmenter.name, config=config)
+    mapper = LiveMapper(
+        drive.cameras,
+        segmenter.label_set,
+        model=segmenter.name,
+        confusion=confusion_of(segmenter),
+        config=config,
+    )
     taken_s: dict[str, list[float]] = defaultdict(list)
     events = [(image.timestamp_ns, 1, image) for image in drive.images]
     events += [(sweep.timestamp_ns, 0, sweep) for sweep in drive.sweeps]

@@ -1,6 +1,6 @@
 """Mapping while driving: sweeps and labelled images in, the map around the vehicle out.
 
-    mapper = LiveMapper(cameras, label_set, model="street-small")
+    mapper = LiveMapper(cameras, label_set, confusion=confusion)   # how the network errs
     mapper.add_sweep(sweep, city_SE3_ego)                        # at the lidar's rate
     mapper.add_image("front", labels, city_SE3_ego, frame_key)   # at the camera's rate
     window = mapper.window()                                     # whenever it is asked for
@@ -11,6 +11,7 @@ memory does not grow. `examples/live_local_map.py` replays a drive and measures 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 
 from hdmap_tools.association.ground import GroundedSweep
@@ -26,6 +27,7 @@ from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.map_reading import model_for
 from hdmap_tools.plugin_api import MapWindow
 from hdmap_tools.readers.drive import Sweep
+from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.types import NDArrayByte
 
 
@@ -41,7 +43,8 @@ class LiveMapper:
     Args:
         cameras: Calibrated cameras by name.
         label_set: What the ids of label images mean.
-        model: Name of the network, which finds its confusion matrix.
+        model: Name of the network, which finds its confusion matrix, where that is known.
+        confusion: How the network errs, where it says so itself (`confusion_of`).
         config: `association`, `fusion.resolution_m` and `.count_mode`, `observation`, `classes`.
         intensity_threshold: Lidar intensity from which on a return may be paint, 1..255.
         extent_m: (x0, y0, x1, y1) of the local map around the rear axle, x ahead, y left.
@@ -57,6 +60,7 @@ class LiveMapper:
         label_set: LabelSet,
         *,
         model: str = "",
+        confusion: ConfusionMatrix | None = None,
         config: Config | None = None,
         intensity_threshold: int = 128,
         extent_m: tuple[float, float, float, float] = EXTENT_M,
@@ -70,6 +74,7 @@ class LiveMapper:
             count_mode=config.fusion.count_mode,
             intensity_threshold=intensity_threshold,
             model=model,
+            confusion=None if confusion is None else json.loads(confusion.to_json()),
         )
         self.local_map = LocalMap(meta, extent_m, rule)
         self._model = model_for(self.local_map.meta, config)
