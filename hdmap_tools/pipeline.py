@@ -17,7 +17,7 @@ from hdmap_tools.formats.by_name import write_vector_map
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import build_map, map_meta
-from hdmap_tools.opening import open_for
+from hdmap_tools.opening import open_for, with_absolute_paths
 from hdmap_tools.output_folder import CONFIG_NAME, result_folder
 from hdmap_tools.plugin_api import MapWindow
 from hdmap_tools.point_map.for_drive import with_points
@@ -25,7 +25,7 @@ from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.readers.image import read_image
 from hdmap_tools.run_metrics import RunMetrics, versions
 from hdmap_tools.segmentation.cache import LabelCache
-from hdmap_tools.segmentation.open_segmenter import NAMED_MODELS, find_model, open_segmenter
+from hdmap_tools.segmentation.open_segmenter import find_model, open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
@@ -152,33 +152,21 @@ def settled(config: Config, drive: Drive) -> Config:
 
     So that the one written beside the result makes the same map again.
     """
-    segmentation, observation, compare = config.segmentation, config.observation, config.compare
-    association = config.association
-    model = segmentation.model
-    if model is None and segmentation.labels is None:
+    model, reference = config.segmentation.model, config.compare.reference
+    if model is None and config.segmentation.labels is None:
         model = find_model(drive.root)
         _LOG.info("Using the model %s.", model)
-    if str(model) not in NAMED_MODELS:
-        model = _absolute(model)
-    reference = compare.reference
     if reference is None:
         # A vector map does not say where it ends; cells do.
         masks = [p for p in drive.reference_maps if p.suffix == ".png" or p.is_dir()]
         if len(masks) == 1:
             reference = masks[0]
             _LOG.info("Comparing with %s, which lies with the drive.", reference)
-    return config.model_copy(
-        update={
-            "segmentation": segmentation.model_copy(
-                update={"model": model, "labels": _absolute(segmentation.labels)}
-            ),
-            "association": association.model_copy(update={"points": _absolute(association.points)}),
-            "observation": observation.model_copy(
-                update={"confusion": _absolute(observation.confusion)}
-            ),
-            "compare": compare.model_copy(update={"reference": _absolute(reference)}),
-        }
-    )
+    chosen = {
+        "segmentation": config.segmentation.model_copy(update={"model": model}),
+        "compare": config.compare.model_copy(update={"reference": reference}),
+    }
+    return with_absolute_paths(config.model_copy(update=chosen))
 
 
 def check_settings(config: Config, drive: Drive, segmenter: Segmenter) -> None:
@@ -194,10 +182,6 @@ def check_settings(config: Config, drive: Drive, segmenter: Segmenter) -> None:
         raise FormatError(
             f"The reference {reference} does not exist; expected a mask PNG, a map or a truth raster."
         )
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else path.absolute()
 
 
 def compare_with_reference(

@@ -17,7 +17,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
 from hdmap_tools.distributed.count_segment import SegmentCounts, SegmentTask, count_segment
-from hdmap_tools.errors import ClusterError, HDMapError, MissingExtraError
+from hdmap_tools.errors import ClusterError, MissingExtraError
 from hdmap_tools.fusion.cell_counts import TileIndex
 from hdmap_tools.fusion.map_store import add_to_tile
 from hdmap_tools.fusion.semantic_map import SemanticMap
@@ -26,8 +26,6 @@ from hdmap_tools.segmentation.cache import SegmentProgress
 
 if TYPE_CHECKING:
     from distributed import Client, Future
-
-_LOG = logging.getLogger(__name__)
 
 _PROGRESS: Final = "hdmap-images"
 _ANSWERS_WITHIN_S: Final = 20.0
@@ -117,6 +115,7 @@ def add_segments(
         HDMapError: Whatever a worker raised.
     """
     from distributed import wait
+    from distributed.scheduler import KilledWorker
 
     heard = count(counts.used + 1)
 
@@ -139,18 +138,12 @@ def add_segments(
             for outline in outlines:
                 counts.used += outline.num_frames
                 counts.observations.update(outline.observations)
-    except HDMapError:
-        raise
-    except Exception as error:
-        from distributed.scheduler import KilledWorker
-
-        if isinstance(error, KilledWorker):
-            raise ClusterError(
-                "Workers died again and again on one part of the drive; most often they run out of "
-                "memory: give each more, or take fewer (--workers). What was committed is kept, and the "
-                "same command goes on from there."
-            ) from error
-        raise
+    except KilledWorker as error:
+        raise ClusterError(
+            "Workers died again and again on one part of the drive; most often they run out of "
+            "memory: give each more, or take fewer (--workers). What was committed is kept, and the "
+            "same command goes on from there."
+        ) from error
     finally:
         client.unsubscribe_topic(_PROGRESS)
 

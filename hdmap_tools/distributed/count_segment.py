@@ -11,11 +11,11 @@ from hdmap_tools.config import Config
 from hdmap_tools.fusion.cell_counts import CellCounts, Tile, TileIndex
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.mapping import FrameCounts, FrameSource, count_images
-from hdmap_tools.opening import open_for
+from hdmap_tools.opening import open_for, with_absolute_paths
 from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
-from hdmap_tools.segmentation.open_segmenter import NAMED_MODELS, open_segmenter
+from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 
 
@@ -47,21 +47,8 @@ class SegmentTask:
         num_images: int,
     ) -> SegmentTask:
         """The same as settings, with paths that hold from anywhere."""
-        segmentation, association = config.segmentation, config.association
-        model = segmentation.model
-        if model is not None and str(model) not in NAMED_MODELS:
-            model = model.absolute()
-        labels, points = segmentation.labels, association.points
-        settled = config.model_copy(
-            update={
-                "segmentation": segmentation.model_copy(
-                    update={"model": model, "labels": labels and labels.absolute()}
-                ),
-                "association": association.model_copy(
-                    update={"points": points and points.absolute(), "also": ()}
-                ),
-            }
-        )
+        alone = config.association.model_copy(update={"also": ()})
+        settled = with_absolute_paths(config.model_copy(update={"association": alone}))
         return cls(
             drive_path.absolute(),
             settled.model_dump_json(),

@@ -250,8 +250,7 @@ class SemanticMap:
         with self._writing() as session:
             session.merge(*write(session.fork()))
             group = zarr.open_group(session.store)
-            group.attrs["drives"] = _changed_drives(_drives_of(group), drives, 1)
-            group.attrs["num_tiles"] = len(listed_tiles(session))
+            _note_drives(session, group, drives, 1)
             listed = ", ".join(map(str, segments))
             version: str = session.commit(
                 f"Add {drive_id}, segments {listed}",
@@ -400,8 +399,7 @@ class SemanticMap:
                     shifted = shift_heights(tile, shift_mm)
                     write_tile(group, index, combine_tiles(held, shifted, sign, index))
             if drives:
-                group.attrs["drives"] = _changed_drives(_drives_of(group), drives, sign)
-                group.attrs["num_tiles"] = len(listed_tiles(session))
+                _note_drives(session, group, drives, sign)
             if not session.has_uncommitted_changes:
                 return session.snapshot_id
             metadata = {"drives": drives, "sign": sign} | (more or {})
@@ -445,6 +443,12 @@ class SemanticMap:
 
 def _drives_of(group: zarr.Group) -> Drives:
     return dict(group.attrs["drives"])  # type: ignore[arg-type]
+
+
+def _note_drives(session: icechunk.Session, group: zarr.Group, changed: Drives, sign: int) -> None:
+    """Bring what the group says of its drives and tiles up to what was written in the session."""
+    group.attrs["drives"] = _changed_drives(_drives_of(group), changed, sign)
+    group.attrs["num_tiles"] = len(listed_tiles(session))
 
 
 def _changed_drives(held: Drives, changed: Drives, sign: int) -> Drives:

@@ -207,12 +207,12 @@ def vote(
             ix = iy = 0
             if num > 1:  # only then may there be a tie; a division takes as long as many points
                 ix, iy = corner[0] + cell % side, corner[1] + cell // side
-            if mode == 0:
+            if mode == POINT:
                 for j in range(num):
                     counts[touched[j], cell] += np.uint32(points[touched[j]])
             elif num == 1:
-                counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == 3 else 1)
-            elif mode == 3:
+                counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == SHARE else 1)
+            elif mode == SHARE:
                 left = SHARE_QUANTA
                 for j in range(num):
                     channel = touched[j]
@@ -258,13 +258,13 @@ def vote(
                             and _hash(ix, iy, other, key) < _hash(ix, iy, best, key)
                         ):
                             best = other
-                    if mode == 1:
+                    if mode == FRAME:
                         counts[best, cell] += np.uint32(1)
                         continue
                     luck = _hash(ix, iy, label, key)
                     if total > won_points or (total == won_points and luck < won_chance):
                         won, won_points, won_chance = best, total, luck
-                if mode == 2:
+                if mode == MAJORITY:
                     counts[won, cell] += np.uint32(1)
             for j in range(num):
                 points[touched[j]] = 0
