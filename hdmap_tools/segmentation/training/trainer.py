@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 
 from hdmap_tools.errors import CheckpointError, ConfigError, LabelError
 from hdmap_tools.formats.atomic import atomic_output
@@ -138,6 +139,10 @@ class _Training:
         model = model.to(device, memory_format=torch.channels_last)
         self.optimizer = _optimizer(preset.optimizer, model)
         self.model = processes.joined(model)
+        self.averaged: AveragedModel | None = None
+        if preset.averaged_steps is not None:
+            mean = _fading_mean(preset.averaged_steps)
+            self.averaged = AveragedModel(model, avg_fn=mean, use_buffers=True)
         weights = class_weights(train_pairs, preset.class_weight_power, settings.seed)
         self.loss = nn.CrossEntropyLoss(
             torch.tensor(weights, dtype=torch.float32, device=device), ignore_index=IGNORE_ID
@@ -153,6 +158,8 @@ class _Training:
     def restore(self, state: dict[str, Any]) -> None:
         try:
             unwrapped(self.model).load_state_dict(state["model"])
+            if self.averaged is not None:
+                self.averaged.load_state_dict(state["averaged"])
             self.optimizer.load_state_dict(state["optimizer"])
             self.scaler.load_state_dict(state["scaler"])
             self.step, self.elapsed_s = state["step"], state["elapsed_s"]
@@ -245,7 +252,14 @@ class _Training:
         self.num_skipped = 0
         self.scaler.step(self.optimizer)
         self.scaler.update()
+        if self.averaged is not None:
+            self.averaged.update_parameters(unwrapped(self.model))
         return value
+
+    @property
+    def judged(self) -> nn.Module:
+        """The network that is validated, kept and exported."""
+        return unwrapped(self.model) if self.averaged is None else self.averaged.module
 
     def _skip(self, buffers: list[Tensor], loss: float, rate: float) -> None:
         """Leave a step out whose loss or gradient is not finite, as mixed precision on GPUs does.
@@ -293,7 +307,7 @@ class _Training:
         num = len(self.val_pairs)
         chosen = np.unique(np.linspace(0, num - 1, min(num, at_most)).round().astype(int))
         mine = confusion_on(
-            unwrapped(self.model),
+            self.judged,
             self.val_pairs,
             [int(index) for index in chosen[processes.rank :: processes.world]],
             preset.augmentation,
@@ -308,7 +322,7 @@ class _Training:
         if self.processes.is_first:
             state = {
                 "offsets": offsets,
-                "model": unwrapped(self.model).state_dict(),
+                "model": self.judged.state_dict(),
                 "step": self.step,
                 "confusion": None if matrix is None else matrix.to_json(),
             }
@@ -318,7 +332,7 @@ class _Training:
         """Measure the best weights on all validation images: what is exported with them."""
         self.processes.wait()
         best = read_state(self.run / BEST)
-        unwrapped(self.model).load_state_dict(best["model"])
+        self.judged.load_state_dict(best["model"])
         if self.val_pairs is None:
             return
         self.step = best["step"]
@@ -345,7 +359,7 @@ class _Training:
         assert self.val_pairs is not None
         preset, num = self.settings.preset, len(self.val_pairs)
         chosen = np.unique(np.linspace(0, num - 1, min(num, preset.validate_images)).astype(int))
-        model = unwrapped(self.model)
+        model = self.judged
         # Each process finds the same.
         scores, truth = sampled_scores(
             model, self.val_pairs, chosen.tolist(), preset.augmentation, self.processes.device
@@ -365,12 +379,24 @@ class _Training:
     def _state(self) -> dict[str, Any]:
         return {
             "model": unwrapped(self.model).state_dict(),
+            "averaged": None if self.averaged is None else self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "scaler": self.scaler.state_dict(),
             "step": self.step,
             "elapsed_s": self.elapsed_s,
             "best_miou": self.best_miou,
         }
+
+
+def _fading_mean(num_steps: int) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+    """A mean of weights over about the last steps; over the last ninth of a run that is younger."""
+
+    def mean(averaged: Tensor, now: Tensor, number: Tensor) -> Tensor:
+        if not averaged.is_floating_point():  # the count of batches seen
+            return now
+        return averaged.lerp(now, max(1 / num_steps, 9 / (9 + int(number))))
+
+    return mean
 
 
 def _optimizer(recipe: Sgd | AdamW, model: nn.Module) -> torch.optim.Optimizer:

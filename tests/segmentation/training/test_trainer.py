@@ -81,6 +81,32 @@ def test_the_same_seed_gives_the_same_weights_and_another_others(
     assert not same(a, c)
 
 
+def test_the_mean_of_the_last_weights_is_judged_and_kept(tmp_path, toy_pairs, toy_run_settings):
+    run, seen = tmp_path / "run", []
+    settings = toy_run_settings(epochs=15)
+    preset = settings.preset.model_copy(update={"averaged_steps": 4, "fits_offsets": False})
+    settings = settings.model_copy(update={"preset": preset})
+
+    def look(_):
+        if (run / CHECKPOINT).exists():  # of the step before
+            seen.append(weights(run))
+
+    train(run, toy_pairs(8), None, settings, checkpoint_every_s=0, stepped=look)
+    steps = [*seen, weights(run)]
+    assert len(steps) == settings.total_steps == 30
+    mean = dict(steps[0])
+    for number, now in enumerate(steps[1:], 1):
+        share = max(1 / 4, 9 / (9 + number))
+        mean = {
+            name: value + share * (now[name] - value) if value.is_floating_point() else now[name]
+            for name, value in mean.items()
+        }
+    kept = read_state(run / BEST)["model"]
+    for name, value in mean.items():
+        torch.testing.assert_close(kept[name], value, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(kept["stage1.0.weight"], steps[-1]["stage1.0.weight"], atol=1e-5)
+
+
 class _StopError(Exception):
     pass
 
