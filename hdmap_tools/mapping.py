@@ -6,15 +6,17 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from hdmap_tools.ahead import made_ahead, taken_ahead
 from hdmap_tools.association.dense import associate_dense, clip_bounds_m
 from hdmap_tools.association.ground import GroundedSweep
+from hdmap_tools.association.live_returns import LiveReturns
 from hdmap_tools.association.lookup import camera_position
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.planar import associate_planar, ground_plane
@@ -36,11 +38,14 @@ from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress, segment_
 from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
-from hdmap_tools.types import NDArrayByte
+from hdmap_tools.types import NDArrayByte, NDArrayFloat
 
 _LOG = logging.getLogger(__name__)
 
 LabelledImages = Iterable[tuple[ImageRef, NDArrayByte]]
+
+Standing = tuple[NDArrayFloat, float] | tuple[()]
+"""Returns of a sweep that are not ground (M, 3), city metres, and the angle between its rings."""
 
 Elsewhere = Callable[[SemanticMap, list[int], "FrameCounts", "SegmentProgress | None"], None]
 """Adds segments, by number, to a map; tells counts what went in, and progress of it."""
@@ -119,6 +124,7 @@ class FrameSource:
         self._config = config
         self.sweeps = sweeps or GroundedSweeps(drive, config)
         self._points: PointMap | None = None
+        self._live: LiveReturns | None = None
         self._engine: DenseFusion | None = None
         if config.association.needs_points:
             if config.association.points is None:
@@ -126,6 +132,8 @@ class FrameSource:
                     "Method 'dense' needs a point map: make one with `hdmap points` and give it with --points."
                 )
             self._points = PointMap.open(config.association.points)
+            gap_s = config.drive.max_pose_gap_s
+            self._live = LiveReturns(drive, self._points, config.association, gap_s)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -181,8 +189,35 @@ class FrameSource:
         """The sweep nearest to an image, with its ground."""
         return self.sweeps.near(image)
 
-    def count(self, method: str, image: ImageRef, labels: NDArrayByte, counts: CellCounts) -> int:
-        """Add what one image says of the ground to counts; gives how many points it labelled."""
+    def with_live_returns(
+        self, labelled: LabelledImages
+    ) -> Iterator[tuple[ImageRef, NDArrayByte, Standing]]:
+        """Labelled images with what stood around the vehicle, read and found while others are fused."""
+
+        def found(image: ImageRef, labels: NDArrayByte) -> tuple[ImageRef, NDArrayByte, Standing]:
+            in_bands = bool(self._config.fusion.range_edges_m)  # `observe` then asks by itself
+            return image, labels, () if in_bands else self.standing(image)
+
+        # One thread: it keeps the last sweeps, which several cameras share.
+        return made_ahead(labelled, lambda pair: found(*pair))
+
+    def count(
+        self,
+        method: str,
+        image: ImageRef,
+        labels: NDArrayByte,
+        counts: CellCounts,
+        live: Standing,
+    ) -> int:
+        """Add what one image says of the ground to counts; gives how many points it labelled.
+
+        Args:
+            method: Of association.
+            image: Names camera and time.
+            labels: (height, width) uint8 ids.
+            counts: Changed.
+            live: What `standing` gives.
+        """
         meta, key = counts.meta, frame_key(image)
         if method != "dense" or meta.range_edges_m:
             seen = self.observe(method, image, labels, meta.label_set, meta.resolution_m)
@@ -191,9 +226,17 @@ class FrameSource:
         assert self._points is not None
         if self._engine is None or self._engine.meta != meta:
             self._engine = DenseFusion(self._points, meta, self._config.association)
-        camera, grounded = self._drive.cameras[image.camera], self.grounded_sweep(image)
-        live = () if grounded is None else (grounded.standing_city, grounded.ring_gap_deg)
-        return self._engine.add(counts, labels, camera, self.pose(image.timestamp_ns), key, *live)
+        camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
+        return self._engine.add(counts, labels, camera, pose, key, *live)
+
+    def standing(self, image: ImageRef) -> Standing:
+        """What stood around the vehicle, for ``dense``; nothing where no sweep is near."""
+        ref = self.sweep_ref(image)
+        if ref is None or self._live is None or not self._config.association.occlusion_test:
+            return ()
+        camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
+        standing = self._live.standing_city(ref, camera, pose)
+        return standing, self._live.ring_gap_deg(ref.sensor)
 
     def observe(
         self,
@@ -220,8 +263,13 @@ class FrameSource:
         resolution_m: float,
     ) -> Observations:
         config: AssociationConfig = self._config.association
-        camera = self._drive.cameras[image.camera]
-        pose, grounded = self.pose(image.timestamp_ns), self.grounded_sweep(image)
+        camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
+        if method == "dense":
+            assert self._points is not None
+            points = self._points.points_in(clip_bounds_m(pose, config))
+            live = self.standing(image)
+            return associate_dense(labels, label_set, camera, pose, points, config, *live)
+        grounded = self.grounded_sweep(image)
         if method == "planar":
             plane_pose = pose if grounded is None else grounded.city_SE3_ego
             return associate_planar(
@@ -233,18 +281,6 @@ class FrameSource:
                 plane_pose,
                 resolution_m,
                 config,
-            )
-        if method == "dense":
-            assert self._points is not None
-            return associate_dense(
-                labels,
-                label_set,
-                camera,
-                pose,
-                self._points.points_in(clip_bounds_m(pose, config)),
-                config,
-                None if grounded is None else grounded.standing_city,
-                2.1 if grounded is None else grounded.ring_gap_deg,
             )
         if grounded is None:
             raise DriveError(f"No lidar sweep near image {image.key}; method {method!r} needs one.")
@@ -306,11 +342,11 @@ def count_images(
         segments: Counts by method, changed.
         counts: Told how many images were used, and what they saw.
     """
-    for image, labels in labelled:
+    for image, labels, live in source.with_live_returns(taken_ahead(labelled)):
         for method, segment in segments.items():
             if not source.allows(method, image):
                 continue
-            seen = source.count(method, image, labels, segment)
+            seen = source.count(method, image, labels, segment, live)
             if method == source.methods[0]:
                 counts.observations[image.camera] += seen
         counts.used += 1

@@ -13,7 +13,7 @@ from hdmap_tools.geometry.camera import MIN_DEPTH_M
 from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayByte, NDArrayFloat, NDArrayInt
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def see_points(
     points_city: NDArrayFloat,
     ego_R_city: NDArrayFloat,
@@ -84,7 +84,7 @@ def see_points(
     return at[:n], pixel[:n], depth[:n], is_far[:n]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def lay_depth(
     buffer: NDArrayFloat,
     at: NDArrayInt,
@@ -114,7 +114,7 @@ def lay_depth(
         buffer[row, column] = min(buffer[row, column], depth[i])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def look_up(
     at: NDArrayInt,
     pixel: NDArrayAny,

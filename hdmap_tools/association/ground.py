@@ -20,6 +20,10 @@ _MAX_SLOPE: Final = 0.15
 """Steeper than any public road; what climbs faster is not ground."""
 _STEP_M: Final = 0.12
 """Allowed beside the slope between two rings: roughness, kerbs and range noise."""
+_NEAREST_M: Final = 1.0
+"""What is nearer is the vehicle."""
+_SAMPLE_M: Final = 0.1
+"""Above the low height of its cell, up to which a return is ground seen there."""
 _SEED_RANGE_M: Final = 12.0
 _SEED_HEIGHT_M: Final = 1.0
 """The ground near the vehicle is within this of its origin, which is at the wheels' height."""
@@ -53,6 +57,17 @@ class GroundSurface:
         xy = np.ascontiguousarray(xy, dtype=np.float64)
         height: NDArrayFloat = heights_between(xy, *self._bins, _REACH_M)
         return height
+
+    def is_near(self, points: NDArrayFloat, tolerance_m: float) -> NDArrayBool:
+        """Which points (N, 3), metres, lie within a tolerance of the ground.
+
+        The height is looked up every half metre and interpolated between.
+        """
+        from hdmap_tools.association.ground_kernels import near_surface
+
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        near: NDArrayBool = near_surface(points, *self._bins, _REACH_M, tolerance_m)
+        return near
 
     def plane(self, max_range_m: float = 15.0) -> tuple[float, float, float] | None:
         """(a, b, c) of ``z = a x + b y + c`` through the ground within a range; None without any."""
@@ -128,20 +143,13 @@ def estimate_ground(points: NDArrayFloat, max_range_m: float = 60.0) -> GroundSu
     """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ShapeError(f"Points must be (N, 3), found {points.shape}.")
-    distance = np.linalg.norm(points[:, :2], axis=1)
-    near = (distance > 1.0) & (distance < max_range_m)
-    points, distance = points[near], distance[near]
-    if len(points) == 0:
-        return GroundSurface(np.zeros((0, 3)))
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    sector = np.floor((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
-    ring = np.floor(distance / _RING_M).astype(np.int64)
+    from hdmap_tools.association.ground_kernels import low_heights, mean_samples, polar_cells
+
     num_rings = int(max_range_m / _RING_M) + 1
-    from hdmap_tools.association.ground_kernels import low_heights
-
-    low = low_heights(sector * num_rings + ring, points[:, 2], _SECTORS * num_rings)
-    low = low.reshape(_SECTORS, num_rings)
-
+    cell = polar_cells(points, max_range_m, _NEAREST_M, _RING_M, _SECTORS, num_rings)
+    low = low_heights(cell, points[:, 2], _SECTORS * num_rings).reshape(_SECTORS, num_rings)
+    if np.isnan(low).all():
+        return GroundSurface(np.zeros((0, 3)))
     seed_cells = low[:, : int(_SEED_RANGE_M / _RING_M)]
     seeds = seed_cells[np.isfinite(seed_cells) & (np.abs(seed_cells) < _SEED_HEIGHT_M)]
     height = np.full(_SECTORS, float(np.median(seeds)) if len(seeds) else 0.0)
@@ -159,25 +167,12 @@ def estimate_ground(points: NDArrayFloat, max_range_m: float = 60.0) -> GroundSu
         height = np.where(ok, low[:, r], height)
         walked = np.where(ok, 0.0, walked)
         accepted[:, r] = ok
-    is_sample = accepted[sector, ring] & (points[:, 2] <= low[sector, ring] + 0.1)
-    cell = (sector * num_rings + ring)[is_sample]
-    number = np.bincount(cell)
-    seen = np.flatnonzero(number)
-    samples = np.column_stack(
-        [np.bincount(cell, weights=points[is_sample, k])[seen] / number[seen] for k in range(3)]
-    )
-    return GroundSurface(samples)
+    ceiling = np.where(accepted, low + _SAMPLE_M, -np.inf)
+    return GroundSurface(mean_samples(points, cell, ceiling.ravel()))
 
 
 def near_ground(points: NDArrayFloat, surface: GroundSurface, tolerance_m: float) -> NDArrayBool:
     """Which points (N, 3) lie within a tolerance of the ground; where it is unknown, none."""
-    near = np.zeros(len(points), dtype=bool)
-    if len(surface.samples) == 0:
-        return near
-    # A height is a mean of samples, so what lies above or below them all is not asked for.
-    low, high = surface.samples[:, 2].min(), surface.samples[:, 2].max()
-    slack_m = tolerance_m + 1e-6
-    may_be = np.flatnonzero((points[:, 2] >= low - slack_m) & (points[:, 2] <= high + slack_m))
-    with np.errstate(invalid="ignore"):
-        near[may_be] = np.abs(points[may_be, 2] - surface.height_at(points[may_be])) <= tolerance_m
-    return near
+    if len(surface.samples) == 0 or len(points) == 0:
+        return np.zeros(len(points), dtype=bool)
+    return surface.is_near(points, tolerance_m)

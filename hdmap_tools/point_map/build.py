@@ -11,13 +11,15 @@ import logging
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hdmap_tools.ahead import made_ahead
 from hdmap_tools.association.ground import estimate_ground, near_ground
 from hdmap_tools.association.visibility import ring_gap_deg
 from hdmap_tools.config import PointsConfig
@@ -36,8 +38,8 @@ from hdmap_tools.readers.drive import Drive, Sweep, SweepRef
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
 
 if TYPE_CHECKING:
-    from hdmap_tools.point_map.moving import SeenThrough
-    from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, VoxelTiles
+    from hdmap_tools.point_map.moving import RangeImage, SeenThrough
+    from hdmap_tools.point_map.thinning import ReturnsByTile, VoxelGrid, Voxels, VoxelTiles
 
 _LOG = logging.getLogger(__name__)
 
@@ -46,6 +48,8 @@ Progress = Callable[[int, int], None]
 
 _SWEEPS_FOR_INTENSITY: Final = 60
 _SWEEPS_FOR_LIDAR: Final = 5
+_READERS: Final = 2
+"""Threads that read sweeps and find their ground, while another adds them up."""
 _ASPHALT_FROM_PATH_M: Final = 2.5
 """Ground this near to the driven path is taken for road."""
 
@@ -112,8 +116,8 @@ def build_point_map(
         PointMapError: If no drive has a sweep with a pose, or no ground is found.
         CRSMismatchError: If the drives have different frames.
     """
-    from hdmap_tools.point_map.moving import SeenThrough
-    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles
+    from hdmap_tools.point_map.moving import RangeImage, SeenThrough
+    from hdmap_tools.point_map.thinning import ReturnsByTile, VoxelGrid, VoxelTiles
 
     if not drives:
         raise PointMapError("A point map needs at least one drive, found none.")
@@ -136,18 +140,28 @@ def build_point_map(
         num_ground = 0
         for posed in drives:
             response = responses[posed.drive.id]
-            for ref in usable[posed.drive.id]:
+            if response is not None and asphalt is not None:
+                response = replace(response, asphalt=asphalt)  # the level of all drives
+
+            def read(
+                ref: SweepRef,
+                posed: PosedDrive = posed,
+                response: IntensityResponse | None = response,
+            ) -> tuple[ReturnsByTile, NDArrayFloat]:
                 seen = sweep_in_city(posed, ref, config)
                 intensity = seen.sweep.intensity
-                if response is not None and asphalt is not None:
-                    at_common_level = IntensityResponse(
-                        response.log_ring, response.log_range, asphalt
-                    )
+                if response is not None:
                     distance = np.linalg.norm(seen.sweep.points_ego, axis=1)
-                    intensity = at_common_level.normalized(intensity, seen.sweep.ring, distance)
-                tiles.add(seen.points_city, intensity, seen.is_ground, seen.range_m)
-                tiles.put_aside(seen.city_SE3_ego.translation, config.max_range_m)
-                num_ground += int(seen.is_ground.sum())
+                    intensity = response.normalized(intensity, seen.sweep.ring, distance)
+                returns = ReturnsByTile.of(
+                    seen.points_city, intensity, seen.is_ground, seen.range_m
+                )
+                return returns, seen.city_SE3_ego.translation
+
+            for returns, xyz in made_ahead(usable[posed.drive.id], read, threads=_READERS):
+                tiles.add_sorted(returns)
+                tiles.put_aside(xyz, config.max_range_m)
+                num_ground += int(returns.is_ground.sum())
                 told.one_more()
         tiles.finish()
         if num_ground == 0:
@@ -176,10 +190,16 @@ def build_point_map(
             for posed in drives:
                 refs = usable[posed.drive.id]
                 lidar_ego, gap_deg = _lidar(posed, refs)
-                for ref in refs:
+
+                def look(
+                    ref: SweepRef, posed: PosedDrive = posed, lidar_ego: NDArrayFloat = lidar_ego
+                ) -> RangeImage:
                     sweep = posed.drive.read_sweep(ref)
                     pose = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
-                    seen_through.look(sweep, pose, lidar_ego, gap_deg)
+                    return RangeImage.of(sweep, pose, lidar_ego)
+
+                for image in made_ahead(refs, look, threads=_READERS):
+                    seen_through.look(image, gap_deg)
                     told.one_more()
         trajectories = {posed.drive.id: posed.trajectory for posed in drives}
         return PointMap.create(folder, meta, _made_tiles(tiles, seen_through), trajectories)
@@ -238,8 +258,9 @@ def _intensity_response(
         return None
     path = cKDTree(posed.trajectory.translations[:, :2])
     statistics = IntensityStatistics()
-    for ref in refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]:
-        seen = sweep_in_city(posed, ref, config)
+    some = refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]
+    read = partial(sweep_in_city, posed, config=config)
+    for seen in made_ahead(some, read, threads=_READERS):
         ground = seen.is_ground
         distance, _ = path.query(
             seen.points_city[ground, :2], distance_upper_bound=_ASPHALT_FROM_PATH_M
@@ -271,11 +292,13 @@ def _lidar(posed: PosedDrive, refs: Sequence[SweepRef]) -> tuple[NDArrayFloat, f
 def _made_tiles(
     tiles: VoxelTiles, seen_through: SeenThrough | None
 ) -> Iterator[tuple[TileIndex, PointTile]]:
-    for index in tiles.tile_indices():
+    def made(index: TileIndex) -> tuple[TileIndex, PointTile]:
         voxels = tiles.voxels(index)
         if seen_through is not None:
             voxels = voxels.keep(~seen_through.is_moving(index, voxels))
-        yield index, made_tile(voxels, tiles.grid)
+        return index, made_tile(voxels, tiles.grid)
+
+    return made_ahead(tiles.tile_indices(), made, threads=_READERS)
 
 
 def made_tile(voxels: Voxels, grid: VoxelGrid) -> PointTile:

@@ -74,7 +74,7 @@ def smooth_ground(
     return SmoothGround(height, seen, mean[seen], scatter[seen], number[seen])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _on_local_planes(
     points: NDArrayFloat,
     weight: NDArrayFloat,

@@ -76,6 +76,25 @@ class _Blocks:
         return cls(of_voxel, key >> 24, layer, centres.astype(np.float32))
 
 
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """How far a sweep saw in each direction; made in any thread.
+
+    Attributes:
+        range_m: (rows, columns) float32 nearest return; infinite where nothing came back.
+        city_SE3_lidar: Where from.
+    """
+
+    range_m: NDArrayFloat32
+    city_SE3_lidar: SE3
+
+    @classmethod
+    def of(cls, sweep: Sweep, city_SE3_ego: SE3, lidar_ego: NDArrayFloat) -> RangeImage:
+        """From a whole sweep at its pose, whose rays come from (3,), ego frame, metres."""
+        image = _range_image(sweep.points_ego, lidar_ego)
+        return cls(image, city_SE3_ego @ SE3(np.eye(3), lidar_ego))
+
+
 class SeenThrough:
     """Counts by block how many sweeps met it, and how many saw through it."""
 
@@ -85,19 +104,14 @@ class SeenThrough:
         self._recent: OrderedDict[TileIndex, _Blocks] = OrderedDict()
         self._counts: dict[TileIndex, NDArrayAny] = {}
 
-    def look(
-        self, sweep: Sweep, city_SE3_ego: SE3, lidar_ego: NDArrayFloat, gap_deg: float = 2.1
-    ) -> None:
+    def look(self, image: RangeImage, gap_deg: float = 2.1) -> None:
         """Hold a whole sweep against the blocks around it.
 
         Args:
-            sweep: All its returns, near and far.
-            city_SE3_ego: Its pose.
-            lidar_ego: (3,) where its rays come from, ego frame, metres.
+            image: Of all its returns, near and far.
             gap_deg: Angle between neighbouring rings.
         """
-        image = _range_image(sweep.points_ego - lidar_ego)
-        city_SE3_lidar = city_SE3_ego @ SE3(np.eye(3), lidar_ego)
+        city_SE3_lidar = image.city_SE3_lidar
         rotation = city_SE3_lidar.rotation
         gap_rows = int(np.ceil(gap_deg / _BIN_DEG))
         tile_m = TILE_MM / 1000.0
@@ -115,7 +129,7 @@ class SeenThrough:
                 )
                 corner = np.array([x * tile_m, y * tile_m, 0.0])
                 origin = city_SE3_lidar.translation - corner
-                _compare(blocks.centres_m, origin, rotation, image, gap_rows, counts)
+                _compare(blocks.centres_m, origin, rotation, image.range_m, gap_rows, counts)
 
     def is_moving(self, index: TileIndex, voxels: Voxels) -> NDArrayBool:
         """(N,) which voxels of a tile are the trail of something that moved."""
@@ -199,12 +213,12 @@ def estimate_lidar_position(sweeps: list[Sweep]) -> NDArrayFloat:
     return np.asarray(fit.x) if ((fit.x > low) & (fit.x < high)).all() else usual
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
-def _range_image(from_lidar: NDArrayFloat) -> NDArrayFloat32:
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _range_image(points: NDArrayFloat, lidar: NDArrayFloat) -> NDArrayFloat32:
     """Nearest range by direction, (rows, columns); infinite where nothing came back."""
     image = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)
-    for i in range(len(from_lidar)):
-        x, y, z = from_lidar[i]
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - lidar[0], points[i, 1] - lidar[1], points[i, 2] - lidar[2]
         distance = np.sqrt(x * x + y * y + z * z)
         if distance < _NEAREST_M - 1.0:
             continue
@@ -218,7 +232,7 @@ def _range_image(from_lidar: NDArrayFloat) -> NDArrayFloat32:
     return image
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _compare(
     centres: NDArrayFloat32,
     origin: NDArrayFloat,

@@ -273,16 +273,13 @@ class PointMap:
             raise PointMapError(f"{self.path} has no tile {index}.")
         listed, name = self._tiles[index], _tile_name(index)
         points = read_table(self.path / "tiles" / name, _POINT_COLUMNS, listed.points_crc32)
-        cells = read_table(self.path / "cells" / name, _CELL_COLUMNS, listed.cells_crc32)
+        cells = self._read_cells(index)
         if (found := len(points["cell"])) != listed.num_points:
             raise PointMapError(
                 f"{self.path / 'tiles' / name} has {found} points, expected {listed.num_points}; it "
                 "is damaged or from another map. Make the map anew."
             )
-        size = self.meta.cells_a_side**2
-        for column in (points["cell"], cells["cell"]):
-            if len(column) and (column[-1] >= size or (np.diff(column.astype(np.int64)) < 0).any()):
-                raise PointMapError(f"{self.path / 'tiles' / name} is not sorted by cell.")
+        self._require_sorted(points["cell"], self.path / "tiles" / name)
         return PointTile(
             np.column_stack([points["x_mm"], points["y_mm"], points["z_mm"]]),
             points["intensity"],
@@ -294,6 +291,30 @@ class PointMap:
             cells["roughness_mm"],
             cells["points"],
         )
+
+    def read_ground(self, index: TileIndex) -> NDArrayFloat:
+        """Ground height (rows, columns) by cell of one tile, metres, NaN without; from disk.
+
+        Raises:
+            PointMapError: If its file is damaged.
+        """
+        side = self.meta.cells_a_side
+        heights = np.full(side * side, np.nan)
+        if index in self._tiles:
+            cells = self._read_cells(index)
+            heights[cells["cell"]] = cells["height_mm"] / 1000.0
+        return heights.reshape(side, side)
+
+    def _read_cells(self, index: TileIndex) -> dict[str, NDArrayAny]:
+        path = self.path / "cells" / _tile_name(index)
+        cells = read_table(path, _CELL_COLUMNS, self._tiles[index].cells_crc32)
+        self._require_sorted(cells["cell"], path)
+        return cells
+
+    def _require_sorted(self, cell: NDArrayAny, path: Path) -> None:
+        size = self.meta.cells_a_side**2
+        if len(cell) and (cell[-1] >= size or (np.diff(cell.astype(np.int64)) < 0).any()):
+            raise PointMapError(f"{path} is not sorted by cell.")
 
     def points_in(self, bounds_m: tuple[float, float, float, float]) -> MapPoints:
         """Points within (x0, y0, x1, y1), city metres, and those that share a cell with such."""

@@ -6,6 +6,7 @@ on when a tile was put aside on disk.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,6 +24,8 @@ _HALF_WEIGHT_RANGE_M: Final = 15.0
 comes from further away counts for less than half."""
 _FIRST_SLOTS: Final = 1 << 14
 _Z_BIAS: Final = 1 << 23
+
+_HASH: Final = 0x9E3779B97F4A7C1
 
 _SUMS: Final = 7
 """Weight, weighted x, y, z offsets in the voxel (mm), weighted intensity, hits, ground hits."""
@@ -94,6 +97,57 @@ def is_ground_of(voxels: Voxels) -> NDArrayBool:
     return np.asarray(2 * voxels.sums[:, 6] >= voxels.sums[:, 5])
 
 
+@dataclass(frozen=True, eq=False)
+class ReturnsByTile:
+    """Returns in whole millimetres, sorted by tile; made in any thread.
+
+    Attributes:
+        points_mm: (N, 3) int64, city frame.
+        intensity: (N,) uint8.
+        is_ground: (N,).
+        weight: (N,) int64.
+        order: (N,) rows by tile.
+        tiles: (T, 2) int64 and
+        starts: (T + 1,) where the rows of each begin in `order`.
+    """
+
+    points_mm: NDArrayInt
+    intensity: NDArrayByte
+    is_ground: NDArrayBool
+    weight: NDArrayInt
+    order: NDArrayInt
+    tiles: NDArrayInt
+    starts: NDArrayInt
+
+    @classmethod
+    def of(
+        cls,
+        points_city: NDArrayFloat,
+        intensity: NDArrayByte,
+        is_ground: NDArrayBool,
+        range_m: NDArrayFloat,
+    ) -> ReturnsByTile:
+        """From returns (N, 3), city metres, and their distance from the vehicle."""
+        points_mm, weight = _in_mm(points_city, range_m)
+        tiles = np.floor_divide(points_mm[:, :2], TILE_MM)
+        low = tiles.min(axis=0) if len(tiles) else np.zeros(2, dtype=np.int64)
+        width, height = (tiles.max(axis=0) - low + 1).tolist() if len(tiles) else (1, 1)
+        tile = (tiles[:, 0] - low[0]) * height + tiles[:, 1] - low[1]
+        if width * height < 2**15:
+            tile = tile.astype(np.int16)  # numbers this short are sorted by counting
+        order = np.argsort(tile, kind="stable")
+        ordered = tile[order]
+        starts = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1 if len(order) else order
+        starts = np.concatenate([[0], starts, [len(order)]]) if len(order) else np.zeros(1, int)
+        found = tiles[order[starts[:-1]]]
+        return cls(points_mm, intensity, is_ground, weight, order, found, starts)
+
+    def rows_of_tiles(self) -> Iterator[tuple[TileIndex, NDArrayInt]]:
+        """Each tile, and which rows lie in it."""
+        for k, (x, y) in enumerate(self.tiles.tolist()):
+            yield (x, y), self.order[self.starts[k] : self.starts[k + 1]]
+
+
 class VoxelTiles:
     """Sums of voxels while sweeps come in; tiles that were left are put aside on disk.
 
@@ -116,25 +170,21 @@ class VoxelTiles:
         range_m: NDArrayFloat,
     ) -> None:
         """Add returns: (N, 3) city metres, (N,) the rest; range_m is from the vehicle."""
-        points_mm = np.rint(points_city * 1000.0).astype(np.int64)
-        tiles = np.floor_divide(points_mm[:, :2], TILE_MM)
-        near = (range_m / _HALF_WEIGHT_RANGE_M) ** 2
-        weight = np.maximum(np.rint(_WEIGHT_AT_ONCE / (1.0 + near)), 1.0).astype(np.int64)
-        tile = tiles[:, 0] * (1 << 32) + tiles[:, 1]
-        order = np.argsort(tile, kind="stable")
-        starts = np.flatnonzero(np.diff(tile[order], prepend=tile[order[:1]] - 1))
-        for rows in np.split(order, starts[1:]) if len(order) else ():
-            index = (int(tiles[rows[0], 0]), int(tiles[rows[0], 1]))
+        self.add_sorted(ReturnsByTile.of(points_city, intensity, is_ground, range_m))
+
+    def add_sorted(self, returns: ReturnsByTile) -> None:
+        """Add returns that know their tiles."""
+        for index, rows in returns.rows_of_tiles():
             table = self._tables.setdefault(index, _Table())
-            corner = np.array([index[0] * TILE_MM, index[1] * TILE_MM, 0], dtype=np.int64)
-            local = points_mm[rows] - corner
             table.make_room(len(rows))
             table.used += int(
                 _add_points(
-                    local,
-                    intensity[rows],
-                    is_ground[rows],
-                    weight[rows],
+                    returns.points_mm,
+                    rows,
+                    (index[0] * TILE_MM, index[1] * TILE_MM),
+                    returns.intensity,
+                    returns.is_ground,
+                    returns.weight,
                     self.grid.voxel_mm,
                     self.grid.cell_mm,
                     table.key,
@@ -196,18 +246,18 @@ class _Table:
             self.key, self.sums = key, sums
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _slot(key: NDArrayInt, wanted: int) -> int:
     """Where a key is, or the empty slot where it belongs."""
     mask = len(key) - 1
     # Fibonacci hashing; the shifts bring the high bits, which hold the cell, down.
-    at = ((wanted ^ (wanted >> 29)) * 0x9E3779B97F4A7C1 >> 20) & mask
+    at = ((wanted ^ (wanted >> 29)) * _HASH >> 20) & mask
     while key[at] != _EMPTY and key[at] != wanted:
         at = (at + 1) & mask
     return at
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _move(old_key: NDArrayInt, old: NDArrayAny, key: NDArrayInt, sums: NDArrayAny) -> None:
     for i in range(len(old_key)):
         if old_key[i] != _EMPTY:
@@ -216,9 +266,24 @@ def _move(old_key: NDArrayInt, old: NDArrayAny, key: NDArrayInt, sums: NDArrayAn
             sums[at] = old[i]
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _in_mm(points_city: NDArrayFloat, range_m: NDArrayFloat) -> tuple[NDArrayInt, NDArrayInt]:
+    """Positions (N, 3) in whole millimetres, and weights (N,)."""
+    points_mm = np.empty((len(points_city), 3), dtype=np.int64)
+    weight = np.empty(len(points_city), dtype=np.int64)
+    for i in range(len(points_city)):
+        for axis in range(3):
+            points_mm[i, axis] = np.int64(np.rint(points_city[i, axis] * 1000.0))
+        away = range_m[i] / _HALF_WEIGHT_RANGE_M
+        weight[i] = max(np.int64(np.rint(_WEIGHT_AT_ONCE / (1.0 + away * away))), 1)
+    return points_mm, weight
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _add_points(
-    local_mm: NDArrayInt,
+    points_mm: NDArrayInt,
+    rows: NDArrayInt,
+    corner_mm: tuple[int, int],
     intensity: NDArrayByte,
     is_ground: NDArrayBool,
     weight: NDArrayInt,
@@ -227,15 +292,19 @@ def _add_points(
     key: NDArrayInt,
     sums: NDArrayAny,
 ) -> int:
-    """Add points of one tile to its table; gives how many voxels are new."""
+    """Add the rows of points that lie in a tile to its table; gives how many voxels are new."""
     side = TILE_MM // cell_mm
+    mask = len(key) - 1
     new = 0
-    for i in range(len(local_mm)):
-        x, y, z = local_mm[i]
+    for i in rows:
+        x, y, z = points_mm[i, 0] - corner_mm[0], points_mm[i, 1] - corner_mm[1], points_mm[i, 2]
         vx, vy, vz = x // voxel_mm, y // voxel_mm, z // voxel_mm
         cell = (y // cell_mm) * side + x // cell_mm
         wanted = (cell << 46) | (vy << 35) | (vx << 24) | (vz + _Z_BIAS)
-        at = _slot(key, wanted)
+        # As `_slot`: an array given to a small function is counted in and out for each return.
+        at = ((wanted ^ (wanted >> 29)) * _HASH >> 20) & mask
+        while key[at] != _EMPTY and key[at] != wanted:
+            at = (at + 1) & mask
         if key[at] == _EMPTY:
             key[at] = wanted
             new += 1

@@ -49,7 +49,7 @@ from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3, Trajectory
 from hdmap_tools.readers.cameras import mount_from_quaternion, select_cameras
 from hdmap_tools.readers.checks import MAX_TIME_NS, name_problem, shown
-from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, keep_usable, to_bytes
+from hdmap_tools.readers.drive import Drive, ImageRef, Sweep, SweepRef, is_usable, to_bytes
 from hdmap_tools.readers.feather import read_columns
 from hdmap_tools.readers.folders import os_errors_are_drive_errors
 from hdmap_tools.readers.motion import compensate_ego_motion
@@ -183,9 +183,13 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
     """
     required = ("x", "y", "z", "intensity") + (("offset_ns",) if trajectory is not None else ())
     columns = read_columns(ref.path, required, ("laser_number",), SweepError)
-    values = np.column_stack([columns[name].astype(np.float64) for name in columns])
-    values, num_dropped = keep_usable(values)
-    if not len(values):
+    points = np.column_stack([columns[name].astype(np.float64) for name in ("x", "y", "z")])
+    usable = is_usable(points)
+    for column in columns.values():
+        if column.dtype.kind == "f":
+            usable &= np.isfinite(column)
+    num_dropped = len(points) - int(usable.sum())
+    if num_dropped == len(points):
         found = (
             f"all {num_dropped} points are NaN or infinite, or beyond 10 km"
             if num_dropped
@@ -196,10 +200,11 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
         logger.warning(
             "%s: dropped %d points that are NaN, infinite or beyond 10 km", ref.path, num_dropped
         )
-    kept = dict(zip(columns, values.T, strict=True))
-    points = np.ascontiguousarray(values[:, :3])
+    kept = columns
+    if num_dropped:
+        points, kept = points[usable], {name: column[usable] for name, column in columns.items()}
     if trajectory is not None:
-        offsets_ns = kept["offset_ns"]
+        offsets_ns = kept["offset_ns"].astype(np.float64)
         if np.abs(offsets_ns).max() > _MAX_OFFSET_NS:
             raise SweepError(
                 f"Sweep {ref.path}: offset_ns runs from {offsets_ns.min():g} to "
@@ -208,7 +213,7 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
         points = compensate_ego_motion(
             points, offsets_ns.astype(np.int64), ref.timestamp_ns, trajectory
         )
-    ring = kept.get("laser_number", np.zeros(len(points)))
+    ring = kept.get("laser_number", np.zeros(len(points), dtype=np.uint8))
     return Sweep(
         timestamp_ns=ref.timestamp_ns,
         points_ego=points,

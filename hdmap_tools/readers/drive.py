@@ -14,7 +14,7 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import Trajectory
 from hdmap_tools.readers.checks import MAX_RANGE_M
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayByte, NDArrayFloat, NDArrayInt
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +139,16 @@ def keep_usable(values: NDArrayFloat) -> tuple[NDArrayFloat, int]:
     Dropped are rows with a value that is NaN or infinite, and points further from
     the sensor than `MAX_RANGE_M`.
     """
-    # NaN compares as False, infinity as too far.
-    usable = np.isfinite(values).all(axis=1) & (np.abs(values[:, :3]) <= MAX_RANGE_M).all(axis=1)
+    usable = np.isfinite(values).all(axis=1) & is_usable(values[:, :3])
     return values[usable], int((~usable).sum())
+
+
+def is_usable(points: NDArrayFloat) -> NDArrayBool:
+    """Which points (N, 3), metres, are finite and no further from the sensor than `MAX_RANGE_M`."""
+    # NaN compares as False, infinity as too far.
+    if bool((np.abs(points) <= MAX_RANGE_M).all()):  # nearly always, and without a test by row
+        return np.ones(len(points), dtype=bool)
+    return np.asarray((np.abs(points) <= MAX_RANGE_M).all(axis=1))
 
 
 def to_bytes(values: NDArrayAny, name: str, path: Path) -> NDArrayByte:
@@ -151,6 +158,8 @@ def to_bytes(values: NDArrayAny, name: str, path: Path) -> NDArrayByte:
         SweepError: If a value lies outside 0..255: clipping or wrapping it would
             change what the intensity means without a word.
     """
+    if values.dtype == np.uint8:
+        return values
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     if low < 0 or high > 255:
         raise SweepError(f"Sweep {path}: {name} runs from {low:g} to {high:g}; expected 0..255.")
