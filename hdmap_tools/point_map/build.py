@@ -39,7 +39,7 @@ from hdmap_tools.types import NDArrayBool, NDArrayFloat
 
 if TYPE_CHECKING:
     from hdmap_tools.point_map.moving import RangeImage, SeenThrough
-    from hdmap_tools.point_map.thinning import ReturnsByTile, VoxelGrid, Voxels, VoxelTiles
+    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelReturns, Voxels, VoxelTiles
 
 _LOG = logging.getLogger(__name__)
 
@@ -79,7 +79,6 @@ class SweepInCity:
     """One sweep at its pose: returns within range, and which are ground.
 
     Attributes:
-        whole: As read.
         sweep: Only returns within range.
         city_SE3_ego: Pose.
         points_city: (N, 3) metres.
@@ -87,12 +86,16 @@ class SweepInCity:
         is_ground: (N,).
     """
 
-    whole: Sweep
     sweep: Sweep
     city_SE3_ego: SE3
     points_city: NDArrayFloat
     range_m: NDArrayFloat
     is_ground: NDArrayBool
+
+    @property
+    def distance_m(self) -> NDArrayFloat:
+        """(N,) from the ego origin in space."""
+        return np.hypot(self.range_m, self.sweep.points_ego[:, 2])
 
 
 def build_point_map(
@@ -117,7 +120,7 @@ def build_point_map(
         CRSMismatchError: If the drives have different frames.
     """
     from hdmap_tools.point_map.moving import RangeImage, SeenThrough
-    from hdmap_tools.point_map.thinning import ReturnsByTile, VoxelGrid, VoxelTiles
+    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelReturns, VoxelTiles
 
     if not drives:
         raise PointMapError("A point map needs at least one drive, found none.")
@@ -147,21 +150,23 @@ def build_point_map(
                 ref: SweepRef,
                 posed: PosedDrive = posed,
                 response: IntensityResponse | None = response,
-            ) -> tuple[ReturnsByTile, NDArrayFloat]:
+            ) -> tuple[VoxelReturns, NDArrayFloat, int]:
                 seen = sweep_in_city(posed, ref, config)
                 intensity = seen.sweep.intensity
                 if response is not None:
-                    distance = np.linalg.norm(seen.sweep.points_ego, axis=1)
+                    distance = seen.distance_m
                     intensity = response.normalized(intensity, seen.sweep.ring, distance)
-                returns = ReturnsByTile.of(
-                    seen.points_city, intensity, seen.is_ground, seen.range_m
+                returns = VoxelReturns.of(
+                    seen.points_city, intensity, seen.is_ground, seen.range_m, grid
                 )
-                return returns, seen.city_SE3_ego.translation
+                return returns, seen.city_SE3_ego.translation, int(seen.is_ground.sum())
 
-            for returns, xyz in made_ahead(usable[posed.drive.id], read, threads=_READERS):
-                tiles.add_sorted(returns)
+            for returns, xyz, num_on_ground in made_ahead(
+                usable[posed.drive.id], read, threads=_READERS
+            ):
+                tiles.add_returns(returns)
                 tiles.put_aside(xyz, config.max_range_m)
-                num_ground += int(returns.is_ground.sum())
+                num_ground += num_on_ground
                 told.one_more()
         tiles.finish()
         if num_ground == 0:
@@ -207,22 +212,21 @@ def build_point_map(
 
 def sweep_in_city(posed: PosedDrive, ref: SweepRef, config: PointsConfig) -> SweepInCity:
     """Read one sweep and put it where it was seen."""
+    from hdmap_tools.point_map.sweep_kernels import placed_within
+
     whole = posed.drive.read_sweep(ref)
     city_SE3_ego = posed.trajectory.interpolate(whole.timestamp_ns, np.inf)
-    distance = np.linalg.norm(whole.points_ego[:, :2], axis=1)
-    near = (distance <= config.max_range_m) & (distance >= config.min_range_m)
-    sweep = Sweep(
-        whole.timestamp_ns, whole.points_ego[near], whole.intensity[near], whole.ring[near]
+    near, points_ego, points_city, range_m = placed_within(
+        whole.points_ego,
+        city_SE3_ego.rotation,
+        city_SE3_ego.translation,
+        config.min_range_m,
+        config.max_range_m,
     )
-    surface = estimate_ground(sweep.points_ego, config.max_range_m)
-    return SweepInCity(
-        whole,
-        sweep,
-        city_SE3_ego,
-        city_SE3_ego.transform_from(sweep.points_ego),
-        distance[near],
-        near_ground(sweep.points_ego, surface, config.ground_tolerance_m),
-    )
+    sweep = Sweep(whole.timestamp_ns, points_ego, whole.intensity[near], whole.ring[near])
+    surface = estimate_ground(points_ego, config.max_range_m)
+    is_ground = near_ground(points_ego, surface, config.ground_tolerance_m)
+    return SweepInCity(sweep, city_SE3_ego, points_city, range_m, is_ground)
 
 
 def _usable_sweeps(posed: PosedDrive, max_pose_gap_s: float) -> tuple[SweepRef, ...]:
@@ -268,7 +272,7 @@ def _intensity_response(
         statistics.add(
             seen.sweep.intensity[ground],
             seen.sweep.ring[ground],
-            np.linalg.norm(seen.sweep.points_ego[ground], axis=1),
+            seen.distance_m[ground],
             np.isfinite(distance),
         )
     response = statistics.response()

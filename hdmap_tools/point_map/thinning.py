@@ -6,7 +6,6 @@ on when a tile was put aside on disk.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -25,6 +24,8 @@ comes from further away counts for less than half."""
 _FIRST_SLOTS: Final = 1 << 14
 _Z_BIAS: Final = 1 << 23
 
+_MAX_TILES: Final = 1 << 16
+"""More tiles than that around some returns are sorted by comparing."""
 _HASH: Final = 0x9E3779B97F4A7C1
 
 _SUMS: Final = 7
@@ -98,26 +99,20 @@ def is_ground_of(voxels: Voxels) -> NDArrayBool:
 
 
 @dataclass(frozen=True, eq=False)
-class ReturnsByTile:
-    """Returns in whole millimetres, sorted by tile; made in any thread.
+class VoxelReturns:
+    """Returns that know their voxels, sorted by tile; made in any thread.
 
     Attributes:
-        points_mm: (N, 3) int64, city frame.
-        intensity: (N,) uint8.
-        is_ground: (N,).
-        weight: (N,) int64.
-        order: (N,) rows by tile.
-        tiles: (T, 2) int64 and
-        starts: (T + 1,) where the rows of each begin in `order`.
+        tiles: (T,) indices.
+        starts: (T + 1,) where the returns of each begin.
+        key: (N,) int64 of each return's voxel in its tile.
+        packed: (N,) int64 what each adds to the sums of its voxel, see `_packed`.
     """
 
-    points_mm: NDArrayInt
-    intensity: NDArrayByte
-    is_ground: NDArrayBool
-    weight: NDArrayInt
-    order: NDArrayInt
-    tiles: NDArrayInt
+    tiles: tuple[TileIndex, ...]
     starts: NDArrayInt
+    key: NDArrayInt
+    packed: NDArrayInt
 
     @classmethod
     def of(
@@ -126,26 +121,21 @@ class ReturnsByTile:
         intensity: NDArrayByte,
         is_ground: NDArrayBool,
         range_m: NDArrayFloat,
-    ) -> ReturnsByTile:
+        grid: VoxelGrid,
+    ) -> VoxelReturns:
         """From returns (N, 3), city metres, and their distance from the vehicle."""
-        points_mm, weight = _in_mm(points_city, range_m)
-        tiles = np.floor_divide(points_mm[:, :2], TILE_MM)
-        low = tiles.min(axis=0) if len(tiles) else np.zeros(2, dtype=np.int64)
-        width, height = (tiles.max(axis=0) - low + 1).tolist() if len(tiles) else (1, 1)
-        tile = (tiles[:, 0] - low[0]) * height + tiles[:, 1] - low[1]
-        if width * height < 2**15:
-            tile = tile.astype(np.int16)  # numbers this short are sorted by counting
-        order = np.argsort(tile, kind="stable")
-        ordered = tile[order]
-        starts = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1 if len(order) else order
-        starts = np.concatenate([[0], starts, [len(order)]]) if len(order) else np.zeros(1, int)
-        found = tiles[order[starts[:-1]]]
-        return cls(points_mm, intensity, is_ground, weight, order, found, starts)
-
-    def rows_of_tiles(self) -> Iterator[tuple[TileIndex, NDArrayInt]]:
-        """Each tile, and which rows lie in it."""
-        for k, (x, y) in enumerate(self.tiles.tolist()):
-            yield (x, y), self.order[self.starts[k] : self.starts[k + 1]]
+        tile, local_mm, low, shape = _in_tiles(points_city)
+        if shape[0] * shape[1] <= _MAX_TILES:
+            order, starts = _counted(tile, shape[0] * shape[1])
+        else:
+            order = np.argsort(tile, kind="stable")
+            starts = np.flatnonzero(np.diff(tile[order], prepend=-1))
+            starts = np.append(starts, len(order))
+        found = np.column_stack(np.divmod(tile[order[starts[:-1]]], shape[1])) + low
+        key, packed = _packed(
+            order, local_mm, intensity, is_ground, range_m, grid.voxel_mm, grid.cell_mm
+        )
+        return cls(tuple((x, y) for x, y in found.tolist()), starts, key, packed)
 
 
 class VoxelTiles:
@@ -170,25 +160,22 @@ class VoxelTiles:
         range_m: NDArrayFloat,
     ) -> None:
         """Add returns: (N, 3) city metres, (N,) the rest; range_m is from the vehicle."""
-        self.add_sorted(ReturnsByTile.of(points_city, intensity, is_ground, range_m))
+        self.add_returns(VoxelReturns.of(points_city, intensity, is_ground, range_m, self.grid))
 
-    def add_sorted(self, returns: ReturnsByTile) -> None:
-        """Add returns that know their tiles."""
-        for index, rows in returns.rows_of_tiles():
+    def add_returns(self, returns: VoxelReturns) -> None:
+        """Add returns that know their voxels."""
+        for k, index in enumerate(returns.tiles):
+            part = slice(int(returns.starts[k]), int(returns.starts[k + 1]))
             table = self._tables.setdefault(index, _Table())
-            table.make_room(len(rows))
-            table.used += int(
-                _add_points(
-                    returns.points_mm,
-                    rows,
-                    (index[0] * TILE_MM, index[1] * TILE_MM),
-                    returns.intensity,
-                    returns.is_ground,
-                    returns.weight,
-                    self.grid.voxel_mm,
-                    self.grid.cell_mm,
+            table.make_room(part.stop - part.start)
+            table.used = int(
+                _add_returns(
+                    returns.key[part],
+                    returns.packed[part],
+                    table.slots,
                     table.key,
                     table.sums,
+                    table.used,
                 )
             )
 
@@ -221,99 +208,166 @@ class VoxelTiles:
         table = self._tables.pop(index)
         paths = self._aside.setdefault(index, [])
         path = self._folder / f"{index[0]}_{index[1]}_{len(paths)}.npz"
-        slots = np.flatnonzero(table.key != _EMPTY)
-        slots = slots[np.argsort(table.key[slots])]
-        np.savez(path, key=table.key[slots], sums=table.sums[slots])
+        order = np.argsort(table.key[: table.used])
+        np.savez(path, key=table.key[order], sums=table.sums[order])
         paths.append(path)
 
 
 class _Table:
-    """A hash table of voxels: keys and their sums, open addressing, at most half full."""
+    """Voxels in the order in which they were first met, and a hash table of their rows.
+
+    What is next to each other in a sweep is so next to each other in memory.
+    """
 
     def __init__(self) -> None:
-        self.key = np.full(_FIRST_SLOTS, _EMPTY, dtype=np.int64)
-        self.sums = np.zeros((_FIRST_SLOTS, _SUMS), dtype=np.int32)
+        self.slots = np.full(_FIRST_SLOTS, _EMPTY, dtype=np.int32)
+        self.key = np.empty(_FIRST_SLOTS // 2, dtype=np.int64)
+        self.sums = np.zeros((_FIRST_SLOTS // 2, _SUMS), dtype=np.int32)
         self.used = 0
 
     def make_room(self, more: int) -> None:
-        slots = len(self.key)
-        while 2 * (self.used + more) > slots:
-            slots *= 2
-        if slots > len(self.key):
-            key = np.full(slots, _EMPTY, dtype=np.int64)
-            sums = np.zeros((slots, _SUMS), dtype=np.int32)
-            _move(self.key, self.sums, key, sums)
-            self.key, self.sums = key, sums
+        size = len(self.slots)
+        while 2 * (self.used + more) > size:
+            size *= 2
+        if size > len(self.slots):
+            self.slots = np.full(size, _EMPTY, dtype=np.int32)
+            _fill_slots(self.slots, self.key, self.used)
+            key, sums = self.key[: self.used], self.sums[: self.used]
+            self.key = np.empty(size // 2, dtype=np.int64)
+            self.sums = np.zeros((size // 2, _SUMS), dtype=np.int32)
+            self.key[: self.used], self.sums[: self.used] = key, sums
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _slot(key: NDArrayInt, wanted: int) -> int:
-    """Where a key is, or the empty slot where it belongs."""
-    mask = len(key) - 1
-    # Fibonacci hashing; the shifts bring the high bits, which hold the cell, down.
-    at = ((wanted ^ (wanted >> 29)) * _HASH >> 20) & mask
-    while key[at] != _EMPTY and key[at] != wanted:
-        at = (at + 1) & mask
-    return at
+def _in_tiles(
+    points_city: NDArrayFloat,
+) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt, tuple[int, int]]:
+    """Which tile each return lies in.
+
+    Returns:
+        Number (N,) of the tile, ``column * rows + row`` of those around all returns; whole
+        millimetres (N, 3) from its corner; index (2,) of the first; columns and rows.
+    """
+    count = len(points_city)
+    tiles = np.empty((count, 2), dtype=np.int64)
+    local = np.empty((count, 3), dtype=np.int64)
+    low, high = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    for i in range(count):
+        for axis in range(2):
+            mm = np.int64(np.rint(points_city[i, axis] * 1000.0))
+            tile = mm // TILE_MM
+            tiles[i, axis] = tile
+            local[i, axis] = mm - tile * TILE_MM
+            if i == 0 or tile < low[axis]:
+                low[axis] = tile
+            if i == 0 or tile > high[axis]:
+                high[axis] = tile
+        local[i, 2] = np.int64(np.rint(points_city[i, 2] * 1000.0))
+    columns, rows = high[0] - low[0] + 1, high[1] - low[1] + 1
+    number = np.empty(count, dtype=np.int64)
+    for i in range(count):
+        number[i] = (tiles[i, 0] - low[0]) * rows + tiles[i, 1] - low[1]
+    return number, local, low, (columns, rows)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _move(old_key: NDArrayInt, old: NDArrayAny, key: NDArrayInt, sums: NDArrayAny) -> None:
-    for i in range(len(old_key)):
-        if old_key[i] != _EMPTY:
-            at = _slot(key, old_key[i])
-            key[at] = old_key[i]
-            sums[at] = old[i]
+def _counted(number: NDArrayInt, size: int) -> tuple[NDArrayInt, NDArrayInt]:
+    """Order of numbers 0..size - 1, and where each of those that occur begins, with the end."""
+    first = np.zeros(size + 1, dtype=np.int64)
+    for i in range(len(number)):
+        first[number[i] + 1] += 1
+    found = 0
+    for k in range(size):
+        found += first[k + 1] > 0
+        first[k + 1] += first[k]
+    starts = np.empty(found + 1, dtype=np.int64)
+    found = 0
+    for k in range(size):
+        if first[k + 1] > first[k]:
+            starts[found] = first[k]
+            found += 1
+    starts[found] = len(number)
+    order = np.empty(len(number), dtype=np.int64)
+    for i in range(len(number)):
+        order[first[number[i]]] = i
+        first[number[i]] += 1
+    return order, starts
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _in_mm(points_city: NDArrayFloat, range_m: NDArrayFloat) -> tuple[NDArrayInt, NDArrayInt]:
-    """Positions (N, 3) in whole millimetres, and weights (N,)."""
-    points_mm = np.empty((len(points_city), 3), dtype=np.int64)
-    weight = np.empty(len(points_city), dtype=np.int64)
-    for i in range(len(points_city)):
-        for axis in range(3):
-            points_mm[i, axis] = np.int64(np.rint(points_city[i, axis] * 1000.0))
-        away = range_m[i] / _HALF_WEIGHT_RANGE_M
-        weight[i] = max(np.int64(np.rint(_WEIGHT_AT_ONCE / (1.0 + away * away))), 1)
-    return points_mm, weight
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _add_points(
-    points_mm: NDArrayInt,
-    rows: NDArrayInt,
-    corner_mm: tuple[int, int],
+def _packed(
+    order: NDArrayInt,
+    local_mm: NDArrayInt,
     intensity: NDArrayByte,
     is_ground: NDArrayBool,
-    weight: NDArrayInt,
+    range_m: NDArrayFloat,
     voxel_mm: int,
     cell_mm: int,
+) -> tuple[NDArrayInt, NDArrayInt]:
+    """Voxels of returns, and in one number each: position in the voxel, intensity, ground, weight."""
+    key = np.empty(len(order), dtype=np.int64)
+    packed = np.empty(len(order), dtype=np.int64)
+    # 32 bits divide in a third of the time.
+    side, cell = np.uint32(TILE_MM // cell_mm), np.uint32(cell_mm)
+    edge, layers = np.uint32(voxel_mm), np.int64((1 << 30) // voxel_mm)
+    for k in range(len(order)):
+        i = order[k]
+        x, y = np.uint32(local_mm[i, 0]), np.uint32(local_mm[i, 1])
+        z = np.uint32(local_mm[i, 2] + layers * voxel_mm)
+        vx, vy, vz = x // edge, y // edge, z // edge
+        of_cell = np.int64((y // cell) * side + x // cell)
+        layer = np.int64(vz) - layers + _Z_BIAS
+        key[k] = (of_cell << 46) | (np.int64(vy) << 35) | (np.int64(vx) << 24) | layer
+        away = range_m[i] / _HALF_WEIGHT_RANGE_M
+        weight = np.int64(max(np.rint(_WEIGHT_AT_ONCE / (1.0 + away * away)), 1.0))
+        offset = np.int64(x - vx * edge)
+        offset = offset << 15 | np.int64(y - vy * edge)
+        offset = offset << 15 | np.int64(z - vz * edge)
+        offset = offset << 8 | np.int64(intensity[i])
+        packed[k] = (offset << 1 | np.int64(is_ground[i])) << 7 | weight
+    return key, packed
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _fill_slots(slots: NDArrayAny, key: NDArrayInt, used: int) -> None:
+    """Put rows into an empty hash table."""
+    mask = len(slots) - 1
+    for row in range(used):
+        # Fibonacci hashing; the shifts bring the high bits, which hold the cell, down.
+        at = ((key[row] ^ (key[row] >> 29)) * _HASH >> 20) & mask
+        while slots[at] != _EMPTY:
+            at = (at + 1) & mask
+        slots[at] = row
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_returns(
+    wanted: NDArrayInt,
+    packed: NDArrayInt,
+    slots: NDArrayAny,
     key: NDArrayInt,
     sums: NDArrayAny,
+    used: int,
 ) -> int:
-    """Add the rows of points that lie in a tile to its table; gives how many voxels are new."""
-    side = TILE_MM // cell_mm
-    mask = len(key) - 1
-    new = 0
-    for i in rows:
-        x, y, z = points_mm[i, 0] - corner_mm[0], points_mm[i, 1] - corner_mm[1], points_mm[i, 2]
-        vx, vy, vz = x // voxel_mm, y // voxel_mm, z // voxel_mm
-        cell = (y // cell_mm) * side + x // cell_mm
-        wanted = (cell << 46) | (vy << 35) | (vx << 24) | (vz + _Z_BIAS)
-        # As `_slot`: an array given to a small function is counted in and out for each return.
-        at = ((wanted ^ (wanted >> 29)) * _HASH >> 20) & mask
-        while key[at] != _EMPTY and key[at] != wanted:
+    """Add returns to the sums of their voxels; gives how many voxels there are then."""
+    mask = len(slots) - 1
+    for i in range(len(wanted)):
+        own = wanted[i]
+        at = ((own ^ (own >> 29)) * _HASH >> 20) & mask
+        while slots[at] != _EMPTY and key[slots[at]] != own:
             at = (at + 1) & mask
-        if key[at] == _EMPTY:
-            key[at] = wanted
-            new += 1
-        w = weight[i]
-        sums[at, 0] += w
-        sums[at, 1] += w * (x - vx * voxel_mm)
-        sums[at, 2] += w * (y - vy * voxel_mm)
-        sums[at, 3] += w * (z - vz * voxel_mm)
-        sums[at, 4] += w * intensity[i]
-        sums[at, 5] += 1
-        sums[at, 6] += is_ground[i]
-    return new
+        row = int(slots[at])
+        if row == _EMPTY:
+            row = used
+            slots[at], key[row] = row, own
+            used += 1
+        rest = packed[i]
+        w = np.int32(rest & 127)
+        sums[row, 0] += w
+        sums[row, 1] += w * np.int32(rest >> 46)
+        sums[row, 2] += w * np.int32(rest >> 31 & 32767)
+        sums[row, 3] += w * np.int32(rest >> 16 & 32767)
+        sums[row, 4] += w * np.int32(rest >> 8 & 255)
+        sums[row, 5] += np.int32(1)
+        sums[row, 6] += np.int32(rest >> 7 & 1)
+    return used

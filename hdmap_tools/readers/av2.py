@@ -183,7 +183,9 @@ def read_av2_sweep(ref: SweepRef, trajectory: Trajectory | None = None) -> Sweep
     """
     required = ("x", "y", "z", "intensity") + (("offset_ns",) if trajectory is not None else ())
     columns = read_columns(ref.path, required, ("laser_number",), SweepError)
-    points = np.column_stack([columns[name].astype(np.float64) for name in ("x", "y", "z")])
+    points = np.empty((len(columns["x"]), 3))
+    for axis, name in enumerate(("x", "y", "z")):
+        points[:, axis] = columns[name]
     usable = is_usable(points)
     for column in columns.values():
         if column.dtype.kind == "f":

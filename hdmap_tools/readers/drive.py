@@ -145,8 +145,8 @@ def keep_usable(values: NDArrayFloat) -> tuple[NDArrayFloat, int]:
 
 def is_usable(points: NDArrayFloat) -> NDArrayBool:
     """Which points (N, 3), metres, are finite and no further from the sensor than `MAX_RANGE_M`."""
-    # NaN compares as False, infinity as too far.
-    if bool((np.abs(points) <= MAX_RANGE_M).all()):  # nearly always, and without a test by row
+    # NaN compares as False, infinity as too far. Nearly always all are good: no test by row.
+    if len(points) and points.max() <= MAX_RANGE_M and points.min() >= -MAX_RANGE_M:
         return np.ones(len(points), dtype=bool)
     return np.asarray((np.abs(points) <= MAX_RANGE_M).all(axis=1))
 

@@ -48,7 +48,9 @@ def points(tmp_path):
         return (np.abs(y) < 12.0) & ~((x > 3.0) & (x < 5.0)) & (x < 40.0)
 
     indices = [(x, y) for x in range(-2, 3) for y in (-1, 0)]
-    return PointMap.create(tmp_path / "points", PointMapMeta(), [(i, tile(i, known)) for i in indices])
+    return PointMap.create(
+        tmp_path / "points", PointMapMeta(), [(i, tile(i, known)) for i in indices]
+    )
 
 
 def drive(points_ego, ring=None):
@@ -124,7 +126,9 @@ def test_rings_are_measured_on_the_whole_drive(points):
         ]
     )
     made, _, _ = drive(sweep, np.repeat(rings, 400).astype(np.uint8))
-    assert LiveReturns(made, points, CONFIG, 0.5).ring_gap_deg("lidar") == pytest.approx(1.1, abs=0.05)
+    assert LiveReturns(made, points, CONFIG, 0.5).ring_gap_deg("lidar") == pytest.approx(
+        1.1, abs=0.05
+    )
 
 
 def test_ground_of_cells_without_is_that_of_the_nearest_up_to_four_metres(points):
