@@ -8,7 +8,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +123,7 @@ class FrameSource:
         self._drive = drive
         self._config = config
         self.sweeps = sweeps or GroundedSweeps(drive, config)
+        self._pose = lru_cache(maxsize=64)(drive.trajectory.interpolate)
         self._points: PointMap | None = None
         self._live: LiveReturns | None = None
         self._engine: DenseFusion | None = None
@@ -179,7 +180,7 @@ class FrameSource:
 
     def pose(self, timestamp_ns: int) -> SE3:
         """``city_SE3_ego`` at a time."""
-        return self._drive.trajectory.interpolate(timestamp_ns, self._config.drive.max_pose_gap_s)
+        return self._pose(timestamp_ns, self._config.drive.max_pose_gap_s)
 
     def sweep_ref(self, image: ImageRef) -> SweepRef | None:
         """The sweep nearest to an image in time, if it is near enough and has a pose."""

@@ -11,7 +11,7 @@ from numba import njit
 
 from hdmap_tools.types import NDArrayBool, NDArrayFloat, NDArrayInt
 
-_BIN_M = 1.0
+_BIN_M = 2.0
 _NEIGHBOURS = 6
 _LATTICE_M = 0.5
 
@@ -110,7 +110,7 @@ def low_heights(cell: NDArrayInt, heights: NDArrayFloat, num_cells: int) -> NDAr
 def sorted_into_bins(
     samples: NDArrayFloat,
 ) -> tuple[NDArrayFloat, NDArrayInt, tuple[float, float], tuple[int, int]]:
-    """Samples by bins of 1 m, so that those near a place are found without a tree.
+    """Samples by bins of 2 m, so that those near a place are found without a tree.
 
     Args:
         samples: (N, 3) metres, N at least 1.

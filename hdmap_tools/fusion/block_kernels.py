@@ -25,6 +25,41 @@ _AT_ONCE: Final = 2048
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def in_block(
+    points_city: NDArrayFloat,
+    index: tuple[int, int],
+    side: int,
+    resolution_m: float,
+    corner_mm: tuple[int, int],
+) -> tuple[NDArrayInt, NDArrayInt]:
+    """Cells of points in a block, and where they lie in it.
+
+    Args:
+        points_city: (N, 3) metres.
+        index: Of the block.
+        side: Its cells a side.
+        resolution_m: Edge of a cell.
+        corner_mm: South-west corner.
+
+    Returns:
+        (N,) ``y * side + x`` as `grid.cells_of` finds them, -1 outside of the block; and whole
+        millimetres (N, 3), x and y from the corner, z in the city.
+    """
+    cells = np.full(len(points_city), -1, dtype=np.int64)
+    local = np.empty((len(points_city), 3), dtype=np.int64)
+    for i in range(len(points_city)):
+        x, y = points_city[i, 0], points_city[i, 1]
+        column = np.int64(np.floor(x / resolution_m)) - index[0] * side
+        row = np.int64(np.floor(y / resolution_m)) - index[1] * side
+        if 0 <= column < side and 0 <= row < side:
+            cells[i] = row * side + column
+        local[i, 0] = np.int64(np.rint(x * 1000.0)) - corner_mm[0]
+        local[i, 1] = np.int64(np.rint(y * 1000.0)) - corner_mm[1]
+        local[i, 2] = np.int64(np.rint(points_city[i, 2] * 1000.0))
+    return cells, local
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def rows_in_view(
     planes: NDArrayFloat,
     z_range: tuple[float, float],

@@ -12,9 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from hdmap_tools.counting_sort import counting_sort
+from hdmap_tools.fusion.block_kernels import in_block
 from hdmap_tools.fusion.cell_counts import TILE_CELLS, TileIndex, heights_in_mm
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.geometry.grid import cells_of
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.point_map.values import MapPoints
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
@@ -65,29 +66,26 @@ class SortedPoints:
 
     @classmethod
     def from_points(
-        cls, points_mm: NDArrayInt, cells: NDArrayInt, index: BlockIndex, side: int
+        cls, local_mm: NDArrayInt, cells: NDArrayInt, index: BlockIndex, side: int
     ) -> tuple[SortedPoints, NDArrayInt]:
-        """Sort points (N, 3), from the block's corner, by their lattice cells (N, 2); and the order.
+        """Sort points by their cells; and which rows (M,) they are.
 
         Args:
-            points_mm: Whole millimetres.
-            cells: All of the block.
+            local_mm: (N, 3) whole millimetres from the block's corner.
+            cells: (N,) cell in the block, ``y * side + x``; points with -1 are left out.
             index: Of the block.
             side: Its cells a side.
         """
-        within = cells - np.array(index) * side
-        flat = within[:, 1] * side + within[:, 0]
-        order = np.argsort(flat, kind="stable")
-        occupied, starts = np.unique(flat[order], return_index=True)
+        order, occupied, starts = counting_sort(cells, side * side)
         rows, columns = np.divmod(occupied, side)
         in_tile = np.array(index) % (TILE_CELLS // side) * side
-        x, y, z = points_mm[order].T
+        x, y, z = (local_mm[order, axis] for axis in range(3))
         heights = (float(z.min()) / 1000.0, float(z.max()) / 1000.0) if len(z) else (0.0, 0.0)
         return cls(
-            np.ascontiguousarray(x, dtype=np.int16),
-            np.ascontiguousarray(y, dtype=np.int16),
-            np.ascontiguousarray(z, dtype=np.float32),
-            np.append(starts, len(flat)).astype(np.int64),
+            x.astype(np.int16),
+            y.astype(np.int16),
+            z.astype(np.float32),
+            starts,
             (rows + in_tile[1]) * TILE_CELLS + columns + in_tile[0],
             columns,
             np.searchsorted(rows, np.arange(side + 1)),
@@ -124,19 +122,20 @@ class PointBlock:
     def from_points(cls, index: BlockIndex, points: MapPoints, meta: MapMeta) -> PointBlock:
         """Take the points of a block out of those of a place."""
         side = block_cells(meta.resolution_m)
-        cells = cells_of(points.points_city, meta.resolution_m)
-        inside = np.flatnonzero((cells // side == np.array(index)).all(axis=1))
-        cells = cells[inside]
-        city, is_ground = points.points_city[inside], points.is_ground[inside]
-        city_mm = np.rint(city * 1000.0).astype(np.int64)
         edge_mm = side * meta.resolution_m * 1000.0
-        level_mm = int(np.median(city_mm[:, 2])) if len(city) else 0
-        corner_mm = np.array([*np.floor(np.array(index) * edge_mm), level_mm], dtype=np.int64)
-        local_mm = city_mm - corner_mm
-        ground, order = SortedPoints.from_points(local_mm[is_ground], cells[is_ground], index, side)
-        standing, _ = SortedPoints.from_points(local_mm[~is_ground], cells[~is_ground], index, side)
-        intensity = points.intensity[inside][is_ground][order]
-        height_mm = heights_in_mm(city[is_ground][order, 2], meta)
+        x_mm, y_mm = (int(np.floor(i * edge_mm)) for i in index)
+        cells, local_mm = in_block(points.points_city, index, side, meta.resolution_m, (x_mm, y_mm))
+        inside = cells >= 0
+        level_mm = int(np.median(local_mm[inside, 2])) if inside.any() else 0
+        local_mm[:, 2] -= level_mm
+        ground, order = SortedPoints.from_points(
+            local_mm, np.where(points.is_ground, cells, -1), index, side
+        )
+        standing, _ = SortedPoints.from_points(
+            local_mm, np.where(points.is_ground, -1, cells), index, side
+        )
+        intensity = points.intensity[order]
+        height_mm = heights_in_mm(points.points_city[order, 2], meta)
         height = height_mm.astype(np.int64)
         sums = (
             ground.sums_of(height),
@@ -146,7 +145,7 @@ class PointBlock:
         of_tile = TILE_CELLS // side
         return cls(
             (index[0] // of_tile, index[1] // of_tile),
-            corner_mm / 1000.0,
+            np.array([x_mm, y_mm, level_mm]) / 1000.0,
             ground,
             (intensity >= meta.intensity_threshold).astype(np.uint8),
             intensity,

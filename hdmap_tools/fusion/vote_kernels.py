@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numba import njit
 
+from hdmap_tools.counting_sort import counting_sort
 from hdmap_tools.fusion.voting import SHARE_QUANTA
 from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayInt
 
@@ -34,30 +35,6 @@ _MAX_TILES: Final = 64
 """More tiles than that at once are sorted by comparing: counts would take 16 MB and more."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _counting_sort(keys: NDArrayInt, size: int) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt]:
-    """Order of keys 0..size - 1, the keys that occur, and where each begins (one more at the end)."""
-    first = np.zeros(size + 1, dtype=np.int64)
-    for i in range(len(keys)):
-        first[keys[i] + 1] += 1
-    num = 0
-    for k in range(size):
-        num += first[k + 1] > 0
-        first[k + 1] += first[k]
-    found, starts = np.empty(num, dtype=np.int64), np.empty(num + 1, dtype=np.int64)
-    num = 0
-    for k in range(size):
-        if first[k + 1] > first[k]:
-            found[num], starts[num] = k, first[k]
-            num += 1
-    starts[num] = len(keys)
-    order = np.empty(len(keys), dtype=np.int64)
-    for i in range(len(keys)):
-        order[first[keys[i]]] = i
-        first[keys[i]] += 1
-    return order, found, starts
-
-
 def by_tile_and_cell(
     cells: NDArrayInt, side: int
 ) -> Iterator[tuple[tuple[int, int], NDArrayInt, NDArrayInt, NDArrayInt]]:
@@ -78,7 +55,7 @@ def by_tile_and_cell(
     within = cells - tiles * side
     keys = (tile * side + within[:, 1]) * side + within[:, 0]
     if width * height <= _MAX_TILES:
-        order, found, starts = _counting_sort(keys, width * height * side * side)
+        order, found, starts = counting_sort(keys, width * height * side * side)
     else:
         order = np.argsort(keys, kind="stable")
         found, starts = np.unique(keys[order], return_index=True)

@@ -12,7 +12,6 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +34,7 @@ from hdmap_tools.point_map.point_map import (
     TileIndex,
 )
 from hdmap_tools.readers.drive import Drive, Sweep, SweepRef
-from hdmap_tools.types import NDArrayBool, NDArrayFloat
+from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat
 
 if TYPE_CHECKING:
     from hdmap_tools.point_map.moving import RangeImage, SeenThrough
@@ -52,6 +51,7 @@ _READERS: Final = 2
 """Threads that read sweeps and find their ground, while another adds them up."""
 _ASPHALT_FROM_PATH_M: Final = 2.5
 """Ground this near to the driven path is taken for road."""
+_PATH_STEP_M: Final = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,21 +260,26 @@ def _intensity_response(
 ) -> IntensityResponse | None:
     if not config.normalize_intensity:
         return None
-    path = cKDTree(posed.trajectory.translations[:, :2])
-    statistics = IntensityStatistics()
-    some = refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]
-    read = partial(sweep_in_city, posed, config=config)
-    for seen in made_ahead(some, read, threads=_READERS):
-        ground = seen.is_ground
-        distance, _ = path.query(
+    path = cKDTree(_every_step(posed.trajectory.translations[:, :2]))
+
+    def asphalt_of(ref: SweepRef) -> tuple[NDArrayByte, NDArrayByte, NDArrayFloat, NDArrayBool]:
+        seen = sweep_in_city(posed, ref, config)
+        ground = np.flatnonzero(seen.is_ground)
+        away, _ = path.query(
             seen.points_city[ground, :2], distance_upper_bound=_ASPHALT_FROM_PATH_M
         )
-        statistics.add(
-            seen.sweep.intensity[ground],
-            seen.sweep.ring[ground],
+        sweep = seen.sweep
+        return (
+            sweep.intensity[ground],
+            sweep.ring[ground],
             seen.distance_m[ground],
-            np.isfinite(distance),
+            np.isfinite(away),
         )
+
+    statistics = IntensityStatistics()
+    some = refs[:: -(-len(refs) // _SWEEPS_FOR_INTENSITY)]
+    for asphalt in made_ahead(some, asphalt_of, threads=_READERS):
+        statistics.add(*asphalt)
     response = statistics.response()
     if response is None:
         _LOG.warning(
@@ -282,6 +287,12 @@ def _intensity_response(
             posed.drive.name,
         )
     return response
+
+
+def _every_step(path: NDArrayFloat) -> NDArrayFloat:
+    """Positions (M, 2) of a path (N, 2), metres, that are about a quarter of a metre apart."""
+    walked = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1))
+    return path[np.unique(np.floor(walked / _PATH_STEP_M), return_index=True)[1]]
 
 
 def _lidar(posed: PosedDrive, refs: Sequence[SweepRef]) -> tuple[NDArrayFloat, float]:

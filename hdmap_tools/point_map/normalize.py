@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numba import njit
 
 from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat, NDArrayInt
 
@@ -44,10 +45,30 @@ class IntensityResponse:
         self, intensity: NDArrayByte, ring: NDArrayByte, range_m: NDArrayFloat
     ) -> NDArrayByte:
         """Intensity (N,) with the response divided out, 0..255, asphalt at `asphalt`."""
-        middle = (np.arange(_NUM_BINS) + 0.5) * _RANGE_BIN_M
-        response = self.log_ring[ring] + np.interp(range_m, middle, self.log_range)
-        gain = np.minimum(self.asphalt / np.exp(response), _MAX_GAIN)
-        return np.clip(np.rint(intensity * gain), 0, 255).astype(np.uint8)
+        gain_of_ring = self.asphalt / np.exp(self.log_ring)
+        normal: NDArrayByte = _normalized(intensity, ring, range_m, gain_of_ring, self.log_range)
+        return normal
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _normalized(
+    intensity: NDArrayByte,
+    ring: NDArrayByte,
+    range_m: NDArrayFloat,
+    gain_of_ring: NDArrayFloat,
+    log_range: NDArrayFloat,
+) -> NDArrayByte:
+    result = np.empty(len(intensity), dtype=np.uint8)
+    last = len(log_range) - 1
+    for i in range(len(intensity)):
+        # Between the middles of the bins; level beyond the first and the last.
+        at = min(max(range_m[i] / _RANGE_BIN_M - 0.5, 0.0), float(last))
+        low = min(int(at), last - 1)
+        share = at - low
+        log = log_range[low] * (1.0 - share) + log_range[low + 1] * share
+        gain = min(gain_of_ring[ring[i]] / np.exp(log), _MAX_GAIN)
+        result[i] = np.uint8(min(max(np.rint(intensity[i] * gain), 0.0), 255.0))
+    return result
 
 
 @dataclass
