@@ -9,7 +9,9 @@ import click
 from hdmap_tools.cli import options
 
 if TYPE_CHECKING:
+    from hdmap_tools.config import Config
     from hdmap_tools.distributed.build import Workers
+    from hdmap_tools.segmentation.cache import LabelCache
 
 
 @click.command()
@@ -28,6 +30,11 @@ if TYPE_CHECKING:
     default=True,
     show_default=True,
     help="Go on with a build that was killed, or throw it away.",
+)
+@click.option(
+    "--repair",
+    is_flag=True,
+    help="Count the damaged tiles of the map at OUT again, given the options that it was built with.",
 )
 @click.option(
     "--workers",
@@ -62,13 +69,17 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     from hdmap_tools.steps import Steps
 
     config = options.resolve_config(given, association__also=[], export__formats=[])
+    cache = options.label_cache(given["cache_folder"], given["no_cache"])
+    if given["repair"]:
+        _repair(ctx, given, config, cache)
+        return
     with options.ImageProgress(ctx.obj["progress"]) as segmented:
         report = build_alone(
             given["drive"],
             given["out"],
             config,
             like=given["like"],
-            cache=options.label_cache(given["cache_folder"], given["no_cache"]),
+            cache=cache,
             overwrite=given["overwrite"],
             resume=given["resume"],
             workers=_workers(given),
@@ -78,6 +89,24 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     click.echo(
         f"{report['drive']}: {report['num_images']} images fused into {report['num_tiles']} tiles at "
         f"{given['out']} in {sum(report['seconds'].values()):.1f} s"
+    )
+
+
+def _repair(
+    ctx: click.Context, given: dict[str, Any], config: Config, cache: LabelCache | None
+) -> None:
+    from hdmap_tools.repair import repair_map
+    from hdmap_tools.steps import Steps
+
+    with options.ImageProgress(ctx.obj["progress"]) as segmented:
+        report = repair_map(
+            given["drive"], given["out"], config, cache=cache, steps=Steps(segmented)
+        )
+    options.write_json(given["json_path"], report, overwrite=given["overwrite"])
+    number = len(report["damaged"])
+    click.echo(
+        f"{given['out']}: {report['num_tiles']} tiles, {number} damaged"
+        + (f", counted again from {report['num_images']} images" if number else "")
     )
 
 

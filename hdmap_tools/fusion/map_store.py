@@ -13,6 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from hdmap_tools.errors import HDMapError, StoreError
 from hdmap_tools.fusion.cell_counts import (
     LATTICE_CELLS,
@@ -23,6 +25,7 @@ from hdmap_tools.fusion.cell_counts import (
     combine_tiles,
 )
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.types import NDArrayAny
 
 if TYPE_CHECKING:
     import icechunk
@@ -120,6 +123,17 @@ def read_tile(group: zarr.Group, index: TileIndex) -> Tile:
     """One tile of a map's group; zeros where nothing was written."""
     rows, cols = _region(index)
     return Tile({name: array[..., rows, cols] for name, array in _arrays(group)})
+
+
+def read_layer(group: zarr.Group, name: str, index: TileIndex) -> NDArrayAny | None:
+    """One layer of a tile; None if its chunk is damaged."""
+    rows, cols = _region(index)
+    try:
+        with store_errors("damaged"):
+            array: Any = group[name]
+            return np.asarray(array[..., rows, cols])
+    except StoreError:
+        return None
 
 
 def write_tile(group: zarr.Group, index: TileIndex, tile: Tile) -> None:

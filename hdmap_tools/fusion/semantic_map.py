@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from hdmap_tools.errors import HDMapError, MapMismatchError, OutputExistsError, StoreError
 from hdmap_tools.fusion.cell_counts import (
+    LAYERS,
     CellCounts,
     Tile,
     TileIndex,
@@ -32,11 +33,13 @@ from hdmap_tools.fusion.map_store import (
     listed_tiles,
     make_arrays,
     quiet_icechunk,
+    read_layer,
     read_tile,
     store_errors,
     write_tile,
 )
 from hdmap_tools.geometry.grid import BevGrid
+from hdmap_tools.types import NDArrayAny
 
 if TYPE_CHECKING:
     import icechunk
@@ -193,7 +196,9 @@ class SemanticMap:
         counts = CellCounts(self.meta)
         with self._reading():
             group = self._group()
-            counts.tiles = {index: read_tile(group, index) for index in self.tile_indices()}
+        for index in self.tile_indices():
+            with self._reading(index):
+                counts.tiles[index] = read_tile(group, index)
         counts.num_frames = sum(drive["num_frames"] for drive in self.drives.values())
         return counts
 
@@ -295,9 +300,27 @@ class SemanticMap:
         with self._reading():
             group = self._group()
         for index in indices:
-            with self._reading():
+            with self._reading(index):
                 tile = read_tile(group, index)
             yield tile
+
+    def damaged_tiles(self) -> dict[TileIndex, tuple[str, ...]]:
+        """Tiles of which a chunk cannot be read, and which layers these are."""
+        with self._reading():
+            group = self._group()
+        found = {}
+        for index in self.tile_indices():
+            layers = tuple(name for name in LAYERS if read_layer(group, name, index) is None)
+            if layers:
+                found[index] = layers
+        return found
+
+    def sound_layers(self, index: TileIndex) -> dict[str, NDArrayAny]:
+        """The layers of a tile that can be read."""
+        with self._reading():
+            group = self._group()
+        layers = {name: read_layer(group, name, index) for name in LAYERS}
+        return {name: layer for name, layer in layers.items() if layer is not None}
 
     def merge(self, other: SemanticMap, name: str = "", *, allow_repeats: bool = False) -> str:
         """Add all that another map holds, tile by tile.
@@ -364,7 +387,7 @@ class SemanticMap:
         def read(index: TileIndex) -> Tile | None:
             if index not in present:
                 return None
-            with self._reading():
+            with self._reading(index):
                 return read_tile(group, index)
 
         return read
@@ -424,10 +447,13 @@ class SemanticMap:
                 raise
 
     @contextmanager
-    def _reading(self) -> Iterator[None]:
-        with store_errors(
+    def _reading(self, tile: TileIndex | None = None) -> Iterator[None]:
+        failed = (
             f"The map at {self.path} is damaged or cannot be read; build it anew or take a copy"
-        ):
+        )
+        if tile is not None:
+            failed = f"Tile {tile} of the map at {self.path} is damaged; `hdmap build --repair` counts it again"
+        with store_errors(failed):
             yield
 
     def _session(self) -> icechunk.Session:

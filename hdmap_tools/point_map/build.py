@@ -191,7 +191,7 @@ def build_point_map(
         )
         seen_through = None
         if config.remove_moving:
-            seen_through = SeenThrough(tiles)
+            seen_through = SeenThrough(tiles, Path(aside))
             for posed in drives:
                 refs = usable[posed.drive.id]
                 lidar_ego, gap_deg = _lidar(posed, refs)
@@ -206,6 +206,7 @@ def build_point_map(
                 for image in made_ahead(refs, look, threads=_READERS):
                     seen_through.look(image, gap_deg)
                     told.one_more()
+            seen_through.finish()
         trajectories = {posed.drive.id: posed.trajectory for posed in drives}
         return PointMap.create(folder, meta, _made_tiles(tiles, seen_through), trajectories)
 

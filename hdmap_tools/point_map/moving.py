@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -95,14 +96,29 @@ class RangeImage:
         return cls(image, city_SE3_ego @ SE3(np.eye(3), lidar_ego))
 
 
-class SeenThrough:
-    """Counts by block how many sweeps met it, and how many saw through it."""
+@dataclass(frozen=True, eq=False)
+class _Watched:
+    """A tile's blocks, and how many sweeps met and saw through each: (2, M) uint16."""
 
-    def __init__(self, tiles: VoxelTiles) -> None:
+    blocks: _Blocks
+    counts: NDArrayAny
+
+
+class SeenThrough:
+    """Counts by block how many sweeps met it, and how many saw through it.
+
+    Tiles that were left keep their counts on disk.
+
+    Args:
+        tiles: All of them put aside.
+        folder: For the counts; must exist.
+    """
+
+    def __init__(self, tiles: VoxelTiles, folder: Path) -> None:
         self._tiles = tiles
+        self._folder = folder
         self._indices = set(tiles.tile_indices())
-        self._recent: OrderedDict[TileIndex, _Blocks] = OrderedDict()
-        self._counts: dict[TileIndex, NDArrayAny] = {}
+        self._recent: OrderedDict[TileIndex, _Watched] = OrderedDict()
 
     def look(self, image: RangeImage, gap_deg: float = 2.1) -> None:
         """Hold a whole sweep against the blocks around it.
@@ -123,34 +139,48 @@ class SeenThrough:
             for y in range(low[1], high[1] + 1):
                 if (x, y) not in self._indices:
                     continue
-                blocks = self._blocks((x, y))
-                counts = self._counts.setdefault(
-                    (x, y), np.zeros((2, len(blocks.layer)), dtype=np.uint16)
-                )
+                tile = self._watched((x, y))
                 corner = np.array([x * tile_m, y * tile_m, 0.0])
                 origin = city_SE3_lidar.translation - corner
-                _compare(blocks.centres_m, origin, rotation, image.range_m, gap_rows, counts)
+                centres = tile.blocks.centres_m
+                _compare(centres, origin, rotation, image.range_m, gap_rows, tile.counts)
 
     def is_moving(self, index: TileIndex, voxels: Voxels) -> NDArrayBool:
-        """(N,) which voxels of a tile are the trail of something that moved."""
+        """(N,) which voxels of a tile are the trail of something that moved; after `finish`."""
         moving = np.zeros(len(voxels), dtype=bool)
-        if index not in self._counts:
+        path = self._path(index)
+        if not path.exists():
             return moving
-        blocks = self._blocks(index)
-        hits, through = self._counts[index].astype(np.int64)
+        blocks = _Blocks.of(voxels, self._tiles.grid)
+        hits, through = np.load(path).astype(np.int64)
         gone = (through >= _FEWEST_THROUGH) & (through >= _THROUGH_PER_HIT * hits)
         gone = _with_tops(blocks, gone, hits, through)
         moving[np.flatnonzero(~is_ground_of(voxels))] = gone[blocks.of_voxel]
         return moving
 
-    def _blocks(self, index: TileIndex) -> _Blocks:
+    def finish(self) -> None:
+        """Put all counts aside."""
+        while self._recent:
+            self._leave_oldest()
+
+    def _watched(self, index: TileIndex) -> _Watched:
         found = self._recent.pop(index, None)
         if found is None:
-            found = _Blocks.of(self._tiles.voxels(index), self._tiles.grid)
+            blocks = _Blocks.of(self._tiles.voxels(index), self._tiles.grid)
+            path = self._path(index)
+            counts = np.zeros((2, len(blocks.layer)), dtype=np.uint16)
+            found = _Watched(blocks, np.load(path) if path.exists() else counts)
         self._recent[index] = found
         while len(self._recent) > _TILES_IN_MEMORY:
-            self._recent.popitem(last=False)
+            self._leave_oldest()
         return found
+
+    def _leave_oldest(self) -> None:
+        index, tile = self._recent.popitem(last=False)
+        np.save(self._path(index), tile.counts)
+
+    def _path(self, index: TileIndex) -> Path:
+        return self._folder / f"seen_{index[0]}_{index[1]}.npy"
 
 
 def _with_tops(
