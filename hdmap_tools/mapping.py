@@ -195,12 +195,16 @@ class FrameSource:
     ) -> Iterator[tuple[ImageRef, NDArrayByte, Standing]]:
         """Labelled images with what stood around the vehicle, read and found while others are fused."""
 
-        def found(image: ImageRef, labels: NDArrayByte) -> tuple[ImageRef, NDArrayByte, Standing]:
-            in_bands = bool(self._config.fusion.range_edges_m)  # `observe` then asks by itself
-            return image, labels, () if in_bands else self.standing(image)
+        def found(pair: tuple[ImageRef, NDArrayByte]) -> tuple[ImageRef, NDArrayByte, Standing]:
+            return *pair, self.live_returns(pair[0])
 
         # One thread: it keeps the last sweeps, which several cameras share.
-        return made_ahead(labelled, lambda pair: found(*pair))
+        return made_ahead(labelled, found)
+
+    def live_returns(self, image: ImageRef) -> Standing:
+        """What `count` wants to know of an image's sweep."""
+        in_bands = bool(self._config.fusion.range_edges_m)  # `observe` then asks by itself
+        return () if in_bands else self.standing(image)
 
     def count(
         self,
@@ -217,7 +221,7 @@ class FrameSource:
             image: Names camera and time.
             labels: (height, width) uint8 ids.
             counts: Changed.
-            live: What `standing` gives.
+            live: What `live_returns` gives.
         """
         meta, key = counts.meta, frame_key(image)
         if method != "dense" or meta.range_edges_m:
@@ -334,6 +338,8 @@ def count_images(
     labelled: LabelledImages,
     segments: Mapping[str, CellCounts],
     counts: FrameCounts,
+    *,
+    ahead: bool = True,
 ) -> None:
     """Add labelled images to counts, by each method on its own.
 
@@ -342,8 +348,15 @@ def count_images(
         labelled: Images with their label images.
         segments: Counts by method, changed.
         counts: Told how many images were used, and what they saw.
+        ahead: Read images and sweeps in other threads while these are counted; off where other
+            processes have the other cores.
     """
-    for image, labels, live in source.with_live_returns(taken_ahead(labelled)):
+    prepared = (
+        source.with_live_returns(taken_ahead(labelled))
+        if ahead
+        else ((image, labels, source.live_returns(image)) for image, labels in labelled)
+    )
+    for image, labels, live in prepared:
         for method, segment in segments.items():
             if not source.allows(method, image):
                 continue

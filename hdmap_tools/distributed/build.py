@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 _PROGRESS: Final = "hdmap-images"
 _ANSWERS_WITHIN_S: Final = 20.0
-_AHEAD: Final = 2
-"""Segments in the queue for each worker: one at work, one that waits."""
+_AHEAD: Final = 3
+"""Segments in the queue for each worker: one at work, two that wait while tiles are written."""
+_AT_ONCE: Final = 10
+"""Priority of what is short and waited for, before segments."""
 
 
 @dataclass(frozen=True)
@@ -126,15 +128,20 @@ def add_segments(
     client.subscribe_topic(_PROGRESS, hear)
     waiting, counting = list(numbers), set[Any]()
     try:
-        while waiting or counting:
+        ready: list[Any] = []
+        while waiting or counting or ready:
             room = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
             while waiting and len(counting) < room:
                 counting.add(client.submit(_count, task, waiting.pop(0), pure=False))
-            wait(counting, return_when="FIRST_COMPLETED")
-            ready = [future for future in counting if future.done()]
-            counting.difference_update(ready)
-            outlines = client.gather([client.submit(_outline, future) for future in ready])
+            if not ready:
+                wait(counting, return_when="FIRST_COMPLETED")
+                ready = [future for future in counting if future.done()]
+                counting.difference_update(ready)
+                continue  # the workers' queues are filled before they are asked to write
+            asked = [client.submit(_outline, future, priority=_AT_ONCE) for future in ready]
+            outlines = client.gather(asked)
             _write(client, semantic_map, drive_id, ready, outlines)
+            ready = []
             for outline in outlines:
                 counts.used += outline.num_frames
                 counts.observations.update(outline.observations)
@@ -180,8 +187,9 @@ def _write(
             holders.setdefault(index, []).append(future)
 
     def write(fork: Any) -> list[Any]:
+        submit = partial(client.submit, priority=_AT_ONCE)
         tasks = [
-            client.submit(_add_tile, fork, index, *[client.submit(_tile, f, index) for f in parts])
+            submit(_add_tile, fork, index, *[submit(_tile, part, index) for part in parts])
             for index, parts in sorted(holders.items())
         ]
         return list(client.gather(tasks))

@@ -96,7 +96,8 @@ def count_segment(
             told()
 
     labelled = segment_drive(drive, segmenter, some, cache, progress)
-    count_images(source, labelled, {source.methods[0]: counts}, frames)
+    # A worker is given one core.
+    count_images(source, labelled, {source.methods[0]: counts}, frames, ahead=False)
     tiles = {index: tile for index, tile in counts.tiles.items() if not tile.is_empty}
     return SegmentCounts(number, counts.num_frames, dict(frames.observations), tiles)
 

@@ -87,7 +87,7 @@ def test_scaling(tmp_path):
 
 @pytest.mark.benchmark_suite
 def test_two_workers(tmp_path):
-    write_long_street(tmp_path, 2000)
+    write_long_street(tmp_path, 5000)  # starting takes seven seconds with any number
     drive, points = tmp_path / "drive", tmp_path / "points"
     hdmap("points", drive, "-o", points, "--no-refine-poses", "-q")
     given = ("--labels", tmp_path / "labels", "--points", points, "--resolution", "0.2", "-q")
