@@ -74,6 +74,7 @@ def connected(workers: Workers) -> Iterator[Client]:
                 processes=True,
                 memory_limit=workers.memory or "auto",
                 dashboard_address=None,
+                silence_logs=logging.ERROR,
             )
             yield stack.enter_context(Client(stack.enter_context(cluster)))
             return

@@ -76,6 +76,7 @@ def store_errors(what: str) -> Iterator[None]:
         RuntimeError,
         BaseZarrError,
         icechunk.IcechunkError,
+        icechunk.ConflictError,
     ) as error:
         raise StoreError(f"{what}: {_one_line(error)}.") from error
 

@@ -12,6 +12,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -119,8 +120,8 @@ def build_point_map(
         PointMapError: If no drive has a sweep with a pose, or no ground is found.
         CRSMismatchError: If the drives have different frames.
     """
-    from hdmap_tools.point_map.moving import RangeImage, SeenThrough
-    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelReturns, VoxelTiles
+    from hdmap_tools.point_map.moving import SeenThrough
+    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles
 
     if not drives:
         raise PointMapError("A point map needs at least one drive, found none.")
@@ -145,22 +146,7 @@ def build_point_map(
             response = responses[posed.drive.id]
             if response is not None and asphalt is not None:
                 response = replace(response, asphalt=asphalt)  # the level of all drives
-
-            def read(
-                ref: SweepRef,
-                posed: PosedDrive = posed,
-                response: IntensityResponse | None = response,
-            ) -> tuple[VoxelReturns, NDArrayFloat, int]:
-                seen = sweep_in_city(posed, ref, config)
-                intensity = seen.sweep.intensity
-                if response is not None:
-                    distance = seen.distance_m
-                    intensity = response.normalized(intensity, seen.sweep.ring, distance)
-                returns = VoxelReturns.of(
-                    seen.points_city, intensity, seen.is_ground, seen.range_m, grid
-                )
-                return returns, seen.city_SE3_ego.translation, int(seen.is_ground.sum())
-
+            read = partial(_returns_of, posed, response=response, grid=grid, config=config)
             for returns, xyz, num_on_ground in made_ahead(
                 usable[posed.drive.id], read, threads=_READERS
             ):
@@ -195,14 +181,7 @@ def build_point_map(
             for posed in drives:
                 refs = usable[posed.drive.id]
                 lidar_ego, gap_deg = _lidar(posed, refs)
-
-                def look(
-                    ref: SweepRef, posed: PosedDrive = posed, lidar_ego: NDArrayFloat = lidar_ego
-                ) -> RangeImage:
-                    sweep = posed.drive.read_sweep(ref)
-                    pose = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
-                    return RangeImage.of(sweep, pose, lidar_ego)
-
+                look = partial(_range_image_of, posed, lidar_ego)
                 for image in made_ahead(refs, look, threads=_READERS):
                     seen_through.look(image, gap_deg)
                     told.one_more()
@@ -228,6 +207,33 @@ def sweep_in_city(posed: PosedDrive, ref: SweepRef, config: PointsConfig) -> Swe
     surface = estimate_ground(points_ego, config.max_range_m)
     is_ground = near_ground(points_ego, surface, config.ground_tolerance_m)
     return SweepInCity(sweep, city_SE3_ego, points_city, range_m, is_ground)
+
+
+def _returns_of(
+    posed: PosedDrive,
+    ref: SweepRef,
+    *,
+    response: IntensityResponse | None,
+    grid: VoxelGrid,
+    config: PointsConfig,
+) -> tuple[VoxelReturns, NDArrayFloat, int]:
+    """A sweep's returns by voxel, where it was seen from, and how many of them are ground."""
+    from hdmap_tools.point_map.thinning import VoxelReturns
+
+    seen = sweep_in_city(posed, ref, config)
+    intensity = seen.sweep.intensity
+    if response is not None:
+        intensity = response.normalized(intensity, seen.sweep.ring, seen.distance_m)
+    returns = VoxelReturns.of(seen.points_city, intensity, seen.is_ground, seen.range_m, grid)
+    return returns, seen.city_SE3_ego.translation, int(seen.is_ground.sum())
+
+
+def _range_image_of(posed: PosedDrive, lidar_ego: NDArrayFloat, ref: SweepRef) -> RangeImage:
+    from hdmap_tools.point_map.moving import RangeImage
+
+    sweep = posed.drive.read_sweep(ref)
+    pose = posed.trajectory.interpolate(sweep.timestamp_ns, np.inf)
+    return RangeImage.of(sweep, pose, lidar_ego)
 
 
 def _usable_sweeps(posed: PosedDrive, max_pose_gap_s: float) -> tuple[SweepRef, ...]:

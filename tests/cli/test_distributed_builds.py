@@ -86,3 +86,13 @@ def test_workers_and_a_scheduler_at_once(street, fails):
         says=("not both",),
         code=2,
     )
+
+
+@pytest.mark.slow
+def test_a_worker_without_enough_memory(street, hdmap, fails, whole):
+    arguments = (*BUILD, "-o", "map", "--workers", 1, "--worker-memory", "170MB")
+    fails(*arguments, says=("Workers died again and again", "memory", "is kept"))
+    assert not (street / "map").exists()
+    code, _, err = hdmap(*BUILD, "-o", "map")
+    assert code == 0, err
+    assert SemanticMap.open(street / "map").read().equals(whole.read())

@@ -172,6 +172,24 @@ def test_damage_to_the_counts_is_found_never_read(tmp_path, part, harm):
     assert SemanticMap.open(stored.path).read().equals(expected)
 
 
+def test_two_that_write_at_once_do_not_overwrite_each_other(stored):
+    other, more = (
+        SemanticMap.open(stored.path),
+        counts_of([(7, random_frame(np.random.default_rng(7)))]),
+    )
+    expected = stored.read().merge(more)
+
+    def tiles_while_another_commits():
+        other.add(more, "drive-of-another")
+        yield from more.tiles.items()
+
+    with pytest.raises(StoreError, match="no other process writes it"):
+        stored.replace(tiles_while_another_commits(), {}, "Replace", {})
+    for one in (stored, other, SemanticMap.open(stored.path)):
+        assert one.read().equals(expected)
+        assert one.history()[0].message == "Add drive-of-another"
+
+
 def test_an_empty_map_adds_nothing_and_takes_nothing_out(stored, tmp_path):
     empty = SemanticMap.create(tmp_path / "empty", meta())
     versions = len(stored.history())
