@@ -7,9 +7,11 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -29,8 +31,10 @@ from hdmap_tools.fusion.dense_fusion import DenseFusion
 from hdmap_tools.fusion.intensity import otsu_threshold
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.fusion.tiles_on_disk import TilesOnDisk
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
+from hdmap_tools.memory_budget import MemoryBudget
 from hdmap_tools.opening import require_images
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.readers.drive import Drive, ImageRef, SweepRef
@@ -114,12 +118,19 @@ class FrameSource:
         drive: The drive, at the poses to be used.
         config: How its images are associated.
         sweeps: Sweeps of the same drive, shared with another source.
+        memory: What may be kept of the point map.
 
     Raises:
         PointMapError: If a method needs a point map and there is none to open.
     """
 
-    def __init__(self, drive: Drive, config: Config, sweeps: GroundedSweeps | None = None) -> None:
+    def __init__(
+        self,
+        drive: Drive,
+        config: Config,
+        sweeps: GroundedSweeps | None = None,
+        memory: MemoryBudget | None = None,
+    ) -> None:
         self._drive = drive
         self._config = config
         self.sweeps = sweeps or GroundedSweeps(drive, config)
@@ -127,6 +138,7 @@ class FrameSource:
         self._points: PointMap | None = None
         self._live: LiveReturns | None = None
         self._engine: DenseFusion | None = None
+        self._memory = memory
         if config.association.needs_points:
             if config.association.points is None:
                 raise PointMapError(
@@ -230,7 +242,8 @@ class FrameSource:
             return len(seen)
         assert self._points is not None
         if self._engine is None or self._engine.meta != meta:
-            self._engine = DenseFusion(self._points, meta, self._config.association)
+            limit = {} if self._memory is None else {"max_bytes": self._memory.points_bytes}
+            self._engine = DenseFusion(self._points, meta, self._config.association, **limit)
         camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
         return self._engine.add(counts, labels, camera, pose, key, *live)
 
@@ -316,6 +329,8 @@ def fuse(
     meta: MapMeta,
     commits: Mapping[str, Callable[[CellCounts], object]],
     counts: FrameCounts,
+    folder: Path,
+    memory: MemoryBudget | None = None,
 ) -> None:
     """Associate and count the labelled images of a segment, by each method on its own.
 
@@ -325,12 +340,22 @@ def fuse(
         meta: What the counts mean.
         commits: By method, what takes the counts of a segment.
         counts: Told how many images were used, and what they saw.
+        folder: For tiles that memory has no room for.
+        memory: What may be kept in memory; None: all.
     """
-    segments = {method: CellCounts(meta) for method in source.methods}
-    count_images(source, labelled, segments, counts)
-    for method, segment in segments.items():
-        if segment.num_frames:
-            commits[method](segment)
+    with ExitStack() as stack:
+        segments = {}
+        for method in source.methods:
+            tiles = None
+            if memory is not None:
+                aside = stack.enter_context(TemporaryDirectory(prefix=".tiles.", dir=folder))
+                share = memory.tiles_bytes(meta) // len(source.methods)
+                tiles = TilesOnDisk(Path(aside), share)
+            segments[method] = CellCounts(meta, tiles)
+        count_images(source, labelled, segments, counts)
+        for method, segment in segments.items():
+            if segment.num_frames:
+                commits[method](segment)
 
 
 def count_images(
@@ -426,6 +451,7 @@ def build_map(
     also_in: Path | None = None,
     resume: bool = False,
     elsewhere: Elsewhere | None = None,
+    memory: MemoryBudget | None = None,
 ) -> tuple[dict[str, SemanticMap], FrameCounts]:
     """Segment, associate and fuse a drive into new semantic maps, one for each method.
 
@@ -445,6 +471,7 @@ def build_map(
             network and configuration.
         elsewhere: Counts the segments of the configured method in other processes; None:
             they are counted here.
+        memory: What may be kept in memory; None: a segment's tiles, and 64 MiB of points.
 
     Returns:
         Maps by method, the configured one first; and what went in.
@@ -457,7 +484,7 @@ def build_map(
             update={"association": config.association.model_copy(update={"also": ()})}
         )
     counts = FrameCounts()
-    source = FrameSource(drive, config)
+    source = FrameSource(drive, config, memory=memory)
     images = source.usable_images(counts)
     for reason, number in counts.dropped.items():
         if number:
@@ -494,6 +521,8 @@ def build_map(
             for number, method in enumerate(source.methods):
                 made = path if number == 0 or also_in is None else also_in / method
                 maps[method] = SemanticMap.create(made, meta)
+        if memory is not None:
+            memory.tiles_bytes(meta)  # says what is too little before the work, not after
         done = maps[source.methods[0]].segments_of(drive.id)
         if done:
             _LOG.info("Going on after %d segments that are in the map already.", len(done))
@@ -506,7 +535,8 @@ def build_map(
         for number in pending:
             some = images[number * size : (number + 1) * size]
             commits = {m: partial(_commit, made, drive.id, number) for m, made in maps.items()}
-            fuse(source, labels_again(some, number * size), meta, commits, counts)
+            labelled = labels_again(some, number * size)
+            fuse(source, labelled, meta, commits, counts, path.parent, memory)
     silent = sorted({i.camera for i in images} - {c for c, n in counts.observations.items() if n})
     if not maps[source.methods[0]].tile_indices():
         raise DriveError(

@@ -23,6 +23,7 @@ from hdmap_tools.fusion.map_store import is_semantic_map
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import FrameCounts, build_map, map_meta
+from hdmap_tools.memory_budget import MemoryBudget
 from hdmap_tools.opening import open_configured, open_for
 from hdmap_tools.output_folder import map_folder, require_free
 from hdmap_tools.point_map.for_drive import with_points
@@ -48,6 +49,7 @@ def build_alone(
     overwrite: bool = False,
     resume: bool = True,
     workers: Workers | None = None,
+    memory: MemoryBudget | None = None,
     steps: Steps | None = None,
 ) -> dict[str, Any]:
     """`build_map` into a place of its own: a new map that is whole or not there.
@@ -64,6 +66,7 @@ def build_alone(
         overwrite: Replace an earlier map.
         resume: Go on with an unfinished build of the same; off, it is thrown away.
         workers: Processes to spread it over; None: all is done in this one.
+        memory: What this process may keep in memory.
         steps: Told of progress.
 
     Returns:
@@ -99,6 +102,7 @@ def build_alone(
                 steps,
                 resume=True,
                 elsewhere=elsewhere,
+                memory=memory,
             )
         made = maps[config.association.method]
         report = {

@@ -11,6 +11,7 @@ from hdmap_tools.cli import options
 if TYPE_CHECKING:
     from hdmap_tools.config import Config
     from hdmap_tools.distributed.build import Workers
+    from hdmap_tools.memory_budget import MemoryBudget
     from hdmap_tools.segmentation.cache import LabelCache
 
 
@@ -35,6 +36,11 @@ if TYPE_CHECKING:
     "--repair",
     is_flag=True,
     help="Count the damaged tiles of the map at OUT again, given the options that it was built with.",
+)
+@click.option(
+    "--memory",
+    metavar="SIZE",
+    help="Keep no more than that in memory, for example 2GB; the rest is put aside on disk.",
 )
 @click.option(
     "--workers",
@@ -83,6 +89,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             overwrite=given["overwrite"],
             resume=given["resume"],
             workers=_workers(given),
+            memory=_memory(given),
             steps=Steps(segmented),
         )
     options.write_json(given["json_path"], report, overwrite=given["overwrite"])
@@ -108,6 +115,23 @@ def _repair(
         f"{given['out']}: {report['num_tiles']} tiles, {number} damaged"
         + (f", counted again from {report['num_images']} images" if number else "")
     )
+
+
+def _memory(given: dict[str, Any]) -> MemoryBudget | None:
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    from hdmap_tools.memory_budget import MemoryBudget
+
+    if given["memory"] is None:
+        return None
+    if given["workers"] is not None or given["scheduler"] is not None:
+        raise click.UsageError("--memory is of one process; with --workers give --worker-memory.")
+    try:
+        return MemoryBudget(TypeAdapter(ByteSize).validate_python(given["memory"]))
+    except ValidationError as error:
+        raise click.UsageError(
+            f"--memory: expected a size such as 2GB, found {given['memory']!r}."
+        ) from error
 
 
 def _workers(given: dict[str, Any]) -> Workers | None:

@@ -9,7 +9,7 @@ drive can be taken out again, all exactly.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, MutableMapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -88,17 +88,21 @@ def heights_in_mm(z_city: NDArrayFloat, meta: MapMeta) -> NDArrayAny:
 
 
 class CellCounts:
-    """Counts of many tiles in memory: what a build adds up, and what maps exchange.
+    """Counts of many tiles: what a build adds up, and what maps exchange.
 
     Attributes:
         meta: What the counts mean; only counts of compatible maps can be added.
         tiles: Tile by index (tx, ty); tile (0, 0) starts at cell (0, 0).
         num_frames: Frames added.
+
+    Args:
+        meta: What the counts mean.
+        tiles: Empty, to keep them in; by default in memory.
     """
 
-    def __init__(self, meta: MapMeta) -> None:
+    def __init__(self, meta: MapMeta, tiles: MutableMapping[TileIndex, Tile] | None = None) -> None:
         self.meta = meta
-        self.tiles: dict[TileIndex, Tile] = {}
+        self.tiles: MutableMapping[TileIndex, Tile] = {} if tiles is None else tiles
         self.num_frames = 0
 
     def add(self, observations: Observations, frame_key: int) -> None:

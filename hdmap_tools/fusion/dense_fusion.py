@@ -52,7 +52,7 @@ class DenseFusion:
         points: PointMap,
         meta: MapMeta,
         config: AssociationConfig,
-        max_bytes: int = 256 * 2**20,
+        max_bytes: int = 64 * 2**20,
     ) -> None:
         if meta.range_edges_m:
             raise ConfigError("The dense engine does not count by range (fusion.range_edges_m).")

@@ -172,7 +172,7 @@ class PointBlocks:
         max_bytes: Of blocks in memory.
     """
 
-    def __init__(self, points: PointMap, meta: MapMeta, max_bytes: int = 256 * 2**20) -> None:
+    def __init__(self, points: PointMap, meta: MapMeta, max_bytes: int = 64 * 2**20) -> None:
         self._points, self._meta, self._max_bytes = points, meta, max_bytes
         self._kept: OrderedDict[BlockIndex, PointBlock] = OrderedDict()
         self._num_bytes = 0

@@ -13,6 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.labels.label_set import load_label_set
+from hdmap_tools.segmentation.label_png import read_label_png, write_label_png
+
 from .long_street import SPEED_MPS, write_long_street
 
 LENGTHS_M = (250, 500, 1000, 2000, 5000, 10000)
@@ -60,12 +64,37 @@ def measured(folder: Path, length_m: float, *more: object, **street: float) -> d
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_drive(tmp_path):
-    """Small: one image and two sweeps a second, 16 rings."""
-    sparse = {"rings": 16, "camera_hz": 2.0, "lidar_hz": 2.0}
-    short = measured(tmp_path / "short", 300, **sparse)
-    long = measured(tmp_path / "long", 1500, **sparse)
+    """Small: two images and two sweeps a second, 16 rings; segments as long as at 13 images a second."""
+    street = {"rings": 16, "camera_hz": 2.0, "lidar_hz": 2.0}
+    segments = ("--set", "fusion.images_per_segment=37")
+    short = measured(tmp_path / "short", 800, *segments, **street)
+    long = measured(tmp_path / "long", 3000, *segments, **street)
     for step in ("points", "build"):
         assert long[f"{step}_mib"] <= 1.2 * short[f"{step}_mib"], (step, short, long)
+
+
+@pytest.mark.slow
+def test_a_memory_budget_holds(tmp_path):
+    """With 124 labels, all of which occur, a tile takes 67 MB, and the segment has two dozen."""
+    write_long_street(tmp_path, 250, rings=16, camera_hz=2.0, lidar_hz=4.0)
+    drive, labels, points = (tmp_path / name for name in ("drive", "labels", "points"))
+    label_set = load_label_set("mapillary-vistas-124")
+    (labels / "label_set.json").write_text(label_set.model_dump_json())
+    some = next(labels.glob("*/*.png"))
+    shape = read_label_png(some).shape
+    ids = np.random.default_rng(0).integers(0, len(label_set), shape).astype(np.uint8)
+    write_label_png(tmp_path / "noise.png", ids)
+    some.write_bytes((tmp_path / "noise.png").read_bytes())  # one file with many names
+    hdmap("points", drive, "-o", points, "--no-refine-poses", "-q")
+    given = ("--labels", labels, "--points", points, "-q", "--resolution", "0.1")
+    free = hdmap("build", drive, "-o", tmp_path / "free", *given)
+    bound = hdmap("build", drive, "-o", tmp_path / "bound", *given, "--memory", "1.4GB")
+    assert free["mib"] * 2**20 > 1.8e9
+    assert bound["mib"] * 2**20 < 1.4e9
+    one, other = (SemanticMap.open(tmp_path / name) for name in ("free", "bound"))
+    assert one.tile_indices() == other.tile_indices()
+    for a, b in zip(one.tiles(one.tile_indices()), other.tiles(one.tile_indices()), strict=True):
+        assert a.equals(b)
 
 
 @pytest.mark.benchmark_suite
@@ -101,8 +130,6 @@ def test_two_workers(tmp_path):
     sys.stderr.write(
         f"\nload {os.getloadavg()[0]:.1f} workers {json.dumps(seconds)} ratio {ratio:.2f}"
     )
-    from hdmap_tools.fusion.semantic_map import SemanticMap
-
     one, two = (SemanticMap.open(tmp_path / f"map{number}").read() for number in (1, 2))
     assert one.tiles.keys() == two.tiles.keys()
     for index, tile in one.tiles.items():
