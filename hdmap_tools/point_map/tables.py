@@ -11,6 +11,7 @@ import numpy as np
 
 from hdmap_tools.errors import HDMapError, PointMapError
 from hdmap_tools.geometry.se3 import Trajectory
+from hdmap_tools.readers.arrow import values_of
 from hdmap_tools.types import NDArrayAny
 
 _TYPES: Final = {
@@ -67,7 +68,7 @@ def read_table(
         )
     columns = {}
     for name in names:
-        found = table[name].to_numpy() if name in table.column_names else np.zeros(0)
+        found = values_of(table[name]) if name in table.column_names else np.zeros(0)
         if name not in table.column_names or found.dtype != _TYPES[name]:
             raise PointMapError(
                 f"{path} of the point map has no column {name} of type {np.dtype(_TYPES[name])}; make the "

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from hdmap_tools.errors import DriveError
+from hdmap_tools.readers.arrow import values_of
 from hdmap_tools.readers.checks import shown_names
 from hdmap_tools.types import NDArrayAny
 
@@ -64,7 +63,7 @@ def read_columns(
         column = table[name]
         if pa.types.is_dictionary(column.type):
             column = column.cast(column.type.value_type)
-        values = np.asarray(column.to_numpy())
+        values = values_of(column)
         if name == "sensor_name":
             if not all(isinstance(value, str) for value in values):
                 raise error_type(f"{path}: column {name} is {column.type}; expected names.")
