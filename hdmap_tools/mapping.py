@@ -521,8 +521,6 @@ def build_map(
             for number, method in enumerate(source.methods):
                 made = path if number == 0 or also_in is None else also_in / method
                 maps[method] = SemanticMap.create(made, meta)
-        if memory is not None:
-            memory.tiles_bytes(meta)  # says what is too little before the work, not after
         done = maps[source.methods[0]].segments_of(drive.id)
         if done:
             _LOG.info("Going on after %d segments that are in the map already.", len(done))

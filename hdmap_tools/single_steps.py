@@ -82,6 +82,8 @@ def build_alone(
             config = settings_of(config, model)
             threshold = model.intensity_threshold
             map_meta(config, drive, segmenter, threshold).require_compatible(model)
+    if memory is not None:
+        memory.tiles_bytes(map_meta(config, drive, segmenter, 1))  # says so if it is too little
     plan = _plan(drive, segmenter, config)
     with resumable_folder(
         out, plan, overwrite=overwrite, is_ours=is_semantic_map, resume=resume

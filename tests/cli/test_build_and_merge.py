@@ -96,6 +96,19 @@ def test_what_is_wrong_is_said_before_the_images_are_read(
     fails("run", "drive", "-o", "out", *LABELS, *arguments, says=(word,))
 
 
+def test_a_memory_budget(street, hdmap, fails):
+    assert hdmap(*BUILD, "free", *LABELS)[0] == 0
+    code, _, err = hdmap(*BUILD, "bound", *LABELS, "--memory", "700MB")
+    assert code == 0, err
+    one, other = (SemanticMap.open(street / name) for name in ("free", "bound"))
+    assert one.read().equals(other.read())
+    fails(*BUILD, "map", *LABELS, "--memory", "300MB", says=("too few", "allow at least"))
+    assert not list(street.glob(".*unfinished"))
+    fails(*BUILD, "map", *LABELS, "--memory", "much", says=("a size such as 2GB",), code=2)
+    both = ("--memory", "1GB", "--workers", 2)
+    fails(*BUILD, "map", *LABELS, *both, says=("--worker-memory",), code=2)
+
+
 def test_labels_without_a_known_confusion_are_believed_alike(street, hdmap):
     # In Cityscapes' numbering 0 is road and 1, 3 are sidewalk and wall.
     city = ("--labels", "labels", "--label-set", "cityscapes")
