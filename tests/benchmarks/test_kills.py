@@ -32,19 +32,19 @@ def test_a_build_killed_at_a_random_moment_ends_with_the_same_map(tmp_path):
     points = ("points", "drive", "-o", "points", "--no-refine-poses", "-q")
     subprocess.run([sys.executable, "-c", PROGRAM, *points], cwd=tmp_path, check=True)
     begin = time.perf_counter()
-    assert build(tmp_path, "whole").wait() == 0
+    with build(tmp_path, "whole") as undisturbed:
+        assert undisturbed.wait() == 0
     lasts_s = time.perf_counter() - begin
     whole = SemanticMap.open(tmp_path / "whole")
     expected, told = whole.read(), [(v.message, v.metadata) for v in whole.history()]
     rng = random.Random(0)
     killed = resumed = 0
     while killed < NUM_KILLS:
-        running = build(tmp_path, "map")
-        time.sleep(rng.uniform(0.0, lasts_s))
-        if running.poll() is None:
-            os.kill(running.pid, signal.SIGKILL)
-            killed += 1
-        running.wait()
+        with build(tmp_path, "map") as running:
+            time.sleep(rng.uniform(0.0, lasts_s))
+            if running.poll() is None:
+                os.kill(running.pid, signal.SIGKILL)
+                killed += 1
         if running.returncode == -signal.SIGKILL and rng.random() < 0.3:
             continue  # killed again before it is done
         if not (tmp_path / "map").exists():
