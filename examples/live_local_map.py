@@ -18,8 +18,8 @@ import numpy as np
 
 from hdmap_tools.config import Config
 from hdmap_tools.errors import HDMapError
+from hdmap_tools.frame_source import frame_key
 from hdmap_tools.live import LiveMapper
-from hdmap_tools.mapping import frame_key
 from hdmap_tools.opening import open_for
 from hdmap_tools.segmentation.known_confusion import confusion_of
 from hdmap_tools.segmentation.open_segmenter import open_segmenter

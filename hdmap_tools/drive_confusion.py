@@ -12,8 +12,8 @@ import numpy as np
 from hdmap_tools.association.planar import ground_plane
 from hdmap_tools.config import Config
 from hdmap_tools.errors import ConfigError
+from hdmap_tools.frame_source import FrameSource
 from hdmap_tools.labels.label_set import LabelSet
-from hdmap_tools.mapping import FrameSource
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.confusion import ConfusionMatrix
 from hdmap_tools.segmentation.measure_confusion import confusion_of_pairs

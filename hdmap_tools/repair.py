@@ -11,10 +11,11 @@ import numpy as np
 
 from hdmap_tools.config import AssociationConfig, Config
 from hdmap_tools.errors import MapMismatchError
+from hdmap_tools.frame_source import FrameCounts, FrameSource
 from hdmap_tools.fusion.cell_counts import TILE_CELLS, CellCounts, Tile, TileIndex
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import Drives, SemanticMap
-from hdmap_tools.mapping import FrameCounts, FrameSource, count_images, map_meta
+from hdmap_tools.mapping import count_images, map_meta
 from hdmap_tools.opening import open_for
 from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import ImageRef

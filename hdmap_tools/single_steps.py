@@ -18,11 +18,12 @@ from hdmap_tools.distributed.build import Workers, add_segments, connected
 from hdmap_tools.distributed.count_segment import SegmentTask
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
+from hdmap_tools.frame_source import FrameCounts
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.map_store import is_semantic_map
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
-from hdmap_tools.mapping import FrameCounts, build_map, map_meta
+from hdmap_tools.mapping import build_map, map_meta
 from hdmap_tools.memory_budget import MemoryBudget
 from hdmap_tools.opening import open_configured, open_for
 from hdmap_tools.output_folder import map_folder, require_free

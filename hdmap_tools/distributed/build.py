@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from hdmap_tools.distributed.count_segment import SegmentCounts, SegmentTask, count_segment
 from hdmap_tools.errors import ClusterError, MissingExtraError
+from hdmap_tools.frame_source import FrameCounts
 from hdmap_tools.fusion.cell_counts import TileIndex
 from hdmap_tools.fusion.map_store import add_to_tile
 from hdmap_tools.fusion.semantic_map import SemanticMap
-from hdmap_tools.mapping import FrameCounts
 from hdmap_tools.segmentation.cache import SegmentProgress
 
 if TYPE_CHECKING:

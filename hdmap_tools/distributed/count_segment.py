@@ -8,9 +8,10 @@ from functools import lru_cache
 from pathlib import Path
 
 from hdmap_tools.config import Config
+from hdmap_tools.frame_source import FrameCounts, FrameSource
 from hdmap_tools.fusion.cell_counts import CellCounts, Tile, TileIndex
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.mapping import FrameCounts, FrameSource, count_images
+from hdmap_tools.mapping import count_images
 from hdmap_tools.opening import open_for, with_absolute_paths
 from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import Drive, ImageRef

@@ -11,20 +11,19 @@ import numpy as np
 
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.config import AssociationMethod, Config
-from hdmap_tools.fusion.cell_counts import CellCounts
-from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.semantic_map import SemanticMap
-from hdmap_tools.fusion.voting import CountMode
-from hdmap_tools.geometry.se3 import SE3
-from hdmap_tools.mapping import (
+from hdmap_tools.frame_source import (
     FrameCounts,
     FrameSource,
     GroundedSweeps,
     LabelledImages,
     frame_key,
-    intensity_threshold,
-    map_meta,
 )
+from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.semantic_map import SemanticMap
+from hdmap_tools.fusion.voting import CountMode
+from hdmap_tools.geometry.se3 import SE3
+from hdmap_tools.mapping import intensity_threshold, map_meta
 from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.segmenter import Segmenter

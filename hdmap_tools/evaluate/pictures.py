@@ -11,11 +11,11 @@ from hdmap_tools.compare.paper import NO_TRUTH
 from hdmap_tools.compare.reliability import ReliabilityReport
 from hdmap_tools.evaluate.experiment import Evaluated
 from hdmap_tools.evaluate.methods import OUR_MAP
+from hdmap_tools.frame_source import FrameSource, frame_key
 from hdmap_tools.fusion.local_map import LocalMap
 from hdmap_tools.geometry.grid import BevGrid
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import MAP_CLASSES, MapClass
-from hdmap_tools.mapping import FrameSource, frame_key
 from hdmap_tools.plugin_api import MapWindow
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.readers.image import read_image
