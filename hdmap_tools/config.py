@@ -364,6 +364,11 @@ class Config(_Step):
             raise ValueError("a class is named twice")
         return classes
 
+    def without_comparison(self) -> Config:
+        """The same with the configured method of association alone."""
+        alone = self.association.model_copy(update={"also": ()})
+        return self.model_copy(update={"association": alone})
+
     def to_yaml(self) -> str:
         """The document that `load_config` reads back."""
         document = self.model_dump(mode="json")

@@ -23,6 +23,7 @@ from hdmap_tools.config import AssociationConfig, Config
 from hdmap_tools.errors import DriveError, PointMapError, PoseError
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.dense_fusion import DenseFusion
+from hdmap_tools.fusion.point_blocks import POINTS_BYTES
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import LabelSet
 from hdmap_tools.memory_budget import MemoryBudget
@@ -117,7 +118,7 @@ class FrameSource:
         self._points: PointMap | None = None
         self._live: LiveReturns | None = None
         self._engine: DenseFusion | None = None
-        self._memory = memory
+        self._points_bytes = POINTS_BYTES if memory is None else memory.points_bytes
         if config.association.needs_points:
             if config.association.points is None:
                 raise PointMapError(
@@ -187,15 +188,10 @@ class FrameSource:
         """Labelled images with what stood around the vehicle, read and found while others are fused."""
 
         def found(pair: tuple[ImageRef, NDArrayByte]) -> tuple[ImageRef, NDArrayByte, Standing]:
-            return *pair, self.live_returns(pair[0])
+            return *pair, self.standing(pair[0])
 
         # One thread: it keeps the last sweeps, which several cameras share.
         return made_ahead(labelled, found)
-
-    def live_returns(self, image: ImageRef) -> Standing:
-        """What `count` wants to know of an image's sweep."""
-        in_bands = bool(self._config.fusion.range_edges_m)  # `observe` then asks by itself
-        return () if in_bands else self.standing(image)
 
     def count(
         self,
@@ -212,17 +208,18 @@ class FrameSource:
             image: Names camera and time.
             labels: (height, width) uint8 ids.
             counts: Changed.
-            live: What `live_returns` gives.
+            live: What `standing` gives.
         """
         meta, key = counts.meta, frame_key(image)
         if method != "dense" or meta.range_edges_m:
-            seen = self.observe(method, image, labels, meta.label_set, meta.resolution_m)
+            seen = self.observe(method, image, labels, meta.label_set, meta.resolution_m, live)
             counts.add(seen, key)
             return len(seen)
         assert self._points is not None
         if self._engine is None or self._engine.meta != meta:
-            limit = {} if self._memory is None else {"max_bytes": self._memory.points_bytes}
-            self._engine = DenseFusion(self._points, meta, self._config.association, **limit)
+            self._engine = DenseFusion(
+                self._points, meta, self._config.association, self._points_bytes
+            )
         camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
         return self._engine.add(counts, labels, camera, pose, key, *live)
 
@@ -242,9 +239,19 @@ class FrameSource:
         labels: NDArrayByte,
         label_set: LabelSet,
         resolution_m: float,
+        live: Standing | None = None,
     ) -> Observations:
-        """What one image says about the ground, by one method of association."""
-        seen = self._associate(method, image, labels, label_set, resolution_m)
+        """What one image says about the ground, by one method of association.
+
+        Args:
+            method: Of association.
+            image: Names camera and time.
+            labels: (height, width) uint8 ids.
+            label_set: What they mean.
+            resolution_m: Of the cells that ``surface`` and ``planar`` look up.
+            live: What `standing` gives, where it was asked already.
+        """
+        seen = self._associate(method, image, labels, label_set, resolution_m, live)
         if not self._config.fusion.range_edges_m:
             return seen
         camera = camera_position(self._drive.cameras[image.camera], self.pose(image.timestamp_ns))
@@ -258,13 +265,14 @@ class FrameSource:
         labels: NDArrayByte,
         label_set: LabelSet,
         resolution_m: float,
+        live: Standing | None,
     ) -> Observations:
         config: AssociationConfig = self._config.association
         camera, pose = self._drive.cameras[image.camera], self.pose(image.timestamp_ns)
         if method == "dense":
             assert self._points is not None
             points = self._points.points_in(clip_bounds_m(pose, config))
-            live = self.standing(image)
+            live = self.standing(image) if live is None else live
             return associate_dense(labels, label_set, camera, pose, points, config, *live)
         grounded = self.grounded_sweep(image)
         if method == "planar":

@@ -111,7 +111,7 @@ def count_images(
     prepared = (
         source.with_live_returns(taken_ahead(labelled))
         if ahead
-        else ((image, labels, source.live_returns(image)) for image, labels in labelled)
+        else ((image, labels, source.standing(image)) for image, labels in labelled)
     )
     for image, labels, live in prepared:
         for method, segment in segments.items():
@@ -207,9 +207,7 @@ def build_map(
         DriveError: If no ground was seen at all.
     """
     if also_in is None:
-        config = config.model_copy(
-            update={"association": config.association.model_copy(update={"also": ()})}
-        )
+        config = config.without_comparison()
     counts = FrameCounts()
     source = FrameSource(drive, config, memory=memory)
     images = source.usable_images(counts)

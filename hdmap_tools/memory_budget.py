@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from hdmap_tools.errors import ConfigError
-from hdmap_tools.fusion.cell_counts import LAYERS, TILE_CELLS
+from hdmap_tools.fusion.cell_counts import TILE_CELLS, Tile
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.point_blocks import POINTS_BYTES
 
 _ITSELF_BYTES: Final = 600 * 10**6
 """The program with its libraries, sweeps, images and what it reads ahead: measured, 450 MB."""
@@ -28,7 +29,7 @@ class MemoryBudget:
     @property
     def points_bytes(self) -> int:
         """Of points of the point map, as the engine keeps them."""
-        return min(64 * 2**20, self._left // 4)
+        return min(POINTS_BYTES, self._left // 4)
 
     def tiles_bytes(self, meta: MapMeta) -> int:
         """Of tiles with counts.
@@ -36,9 +37,7 @@ class MemoryBudget:
         Raises:
             ConfigError: If too little is left for tiles with that many labels.
         """
-        per_cell = 4 * len(meta.label_set) * meta.num_bins
-        per_cell += sum(LAYERS[name]().itemsize for name in LAYERS if name != "counts")
-        tile = TILE_CELLS**2 * per_cell
+        tile = TILE_CELLS**2 * Tile.zeros(len(meta.label_set), meta.num_bins, (1, 1)).num_bytes
         found = self._left - self.points_bytes - _TILES_AT_ONCE * tile
         if found < tile:
             least = (_ITSELF_BYTES + (_TILES_AT_ONCE + 1) * tile * 4 // 3) / 1e6

@@ -70,10 +70,7 @@ def repair_map(
     for (x, y), layers in damaged.items():
         _LOG.warning("Tile (%d, %d) is damaged: %s.", x, y, ", ".join(layers))
     with steps.timed("open"):
-        config = settings_of(config, meta)
-        config = config.model_copy(
-            update={"association": config.association.model_copy(update={"also": ()})}
-        )
+        config = settings_of(config, meta).without_comparison()
         drive = open_for(config, drive_path)
         _require_only(drive.id, drives)
         segmenter = open_segmenter(config.segmentation, drive)

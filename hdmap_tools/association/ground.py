@@ -59,10 +59,12 @@ class GroundSurface:
         return height
 
     def is_near(self, points: NDArrayFloat, tolerance_m: float) -> NDArrayBool:
-        """Which points (N, 3), metres, lie within a tolerance of the ground.
+        """Which points (N, 3), metres, lie within a tolerance of the ground; where it is unknown, none.
 
         The height is looked up every half metre and interpolated between.
         """
+        if len(self.samples) == 0 or len(points) == 0:
+            return np.zeros(len(points), dtype=bool)
         from hdmap_tools.association.ground_kernels import near_surface
 
         points = np.ascontiguousarray(points, dtype=np.float64)
@@ -104,11 +106,6 @@ class GroundedSweep:
     is_ground: NDArrayBool
     ring_gap_deg: float
 
-    @cached_property
-    def standing_city(self) -> NDArrayFloat:
-        """(M, 3) the points that are not on the ground, city frame."""
-        return self.points_city[~self.is_ground]
-
     @classmethod
     def from_sweep(
         cls, sweep: Sweep, city_SE3_ego: SE3, max_range_m: float, tolerance_m: float
@@ -120,7 +117,7 @@ class GroundedSweep:
             city_SE3_ego,
             city_SE3_ego.transform_from(sweep.points_ego),
             surface,
-            near_ground(sweep.points_ego, surface, tolerance_m),
+            surface.is_near(sweep.points_ego, tolerance_m),
             ring_gap_deg(sweep.points_ego, sweep.ring),
         )
 
@@ -169,10 +166,3 @@ def estimate_ground(points: NDArrayFloat, max_range_m: float = 60.0) -> GroundSu
         accepted[:, r] = ok
     ceiling = np.where(accepted, low + _SAMPLE_M, -np.inf)
     return GroundSurface(mean_samples(points, cell, ceiling.ravel()))
-
-
-def near_ground(points: NDArrayFloat, surface: GroundSurface, tolerance_m: float) -> NDArrayBool:
-    """Which points (N, 3) lie within a tolerance of the ground; where it is unknown, none."""
-    if len(surface.samples) == 0 or len(points) == 0:
-        return np.zeros(len(points), dtype=bool)
-    return surface.is_near(points, tolerance_m)

@@ -6,7 +6,7 @@ return stands if it is not at the map's ground height; a sweep's own ground need
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,7 @@ from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.point_map.ground_window import GroundHeights
 from hdmap_tools.point_map.point_map import PointMap
-from hdmap_tools.readers.drive import Drive, Sweep, SweepRef
+from hdmap_tools.readers.drive import Drive, SweepRef
 from hdmap_tools.types import NDArrayFloat
 
 _SWEEPS_FOR_GAP: Final = 5
@@ -41,7 +41,9 @@ class LiveReturns:
     ) -> None:
         self._drive, self._config, self._ground = drive, config, GroundHeights(points)
         self._max_pose_gap_s = max_pose_gap_s
-        self._recent: OrderedDict[int, Sweep] = OrderedDict()
+        # Several cameras share a sweep.
+        self._read = lru_cache(maxsize=_SWEEPS_KEPT)(drive.read_sweep)
+        self._pose = lru_cache(maxsize=_SWEEPS_KEPT)(drive.trajectory.interpolate)
         self._gaps_deg: dict[str, float] = {}
 
     def ring_gap_deg(self, sensor: str) -> float:
@@ -69,9 +71,7 @@ class LiveReturns:
         from hdmap_tools.association.ground_kernels import returns_off_ground
 
         config, sweep = self._config, self._read(ref)
-        city_SE3_sweep = self._drive.trajectory.interpolate(
-            sweep.timestamp_ns, self._max_pose_gap_s
-        )
+        city_SE3_sweep = self._pose(sweep.timestamp_ns, self._max_pose_gap_s)
         clip = clip_of(config, camera)
         corners = np.array([[x, y, 0.0] for x in clip[:2] for y in clip[2:]])
         corners = city_SE3_ego.transform_from(corners)[:, :2]
@@ -88,15 +88,6 @@ class LiveReturns:
             config.ground_tolerance_m,
         )
         return found
-
-    def _read(self, ref: SweepRef) -> Sweep:
-        sweep = self._recent.pop(ref.timestamp_ns, None)
-        if sweep is None:
-            sweep = self._drive.read_sweep(ref)
-        self._recent[ref.timestamp_ns] = sweep
-        if len(self._recent) > _SWEEPS_KEPT:
-            self._recent.popitem(last=False)
-        return sweep
 
 
 def clip_of(config: AssociationConfig, camera: PinholeCamera) -> tuple[float, float, float, float]:

@@ -48,8 +48,7 @@ class SegmentTask:
         num_images: int,
     ) -> SegmentTask:
         """The same as settings, with paths that hold from anywhere."""
-        alone = config.association.model_copy(update={"also": ()})
-        settled = with_absolute_paths(config.model_copy(update={"association": alone}))
+        settled = with_absolute_paths(config.without_comparison())
         return cls(
             drive_path.absolute(),
             settled.model_dump_json(),

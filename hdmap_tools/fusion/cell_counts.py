@@ -66,6 +66,11 @@ class Tile:
         return all(np.array_equal(self.layers[name], other.layers[name]) for name in LAYERS)
 
     @property
+    def num_bytes(self) -> int:
+        """Memory that the layers take."""
+        return sum(layer.nbytes for layer in self.layers.values())
+
+    @property
     def is_empty(self) -> bool:
         """Whether nothing was observed anywhere."""
         return not any(layer.any() for layer in self.layers.values())

@@ -20,7 +20,7 @@ from hdmap_tools.errors import ConfigError
 from hdmap_tools.fusion.block_kernels import lay_block, rows_in_view, see_block
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.point_blocks import PointBlock, PointBlocks, SortedPoints
+from hdmap_tools.fusion.point_blocks import POINTS_BYTES, PointBlock, PointBlocks, SortedPoints
 from hdmap_tools.geometry.camera import MIN_DEPTH_M, PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import IGNORE_ID, LabelSet
@@ -52,7 +52,7 @@ class DenseFusion:
         points: PointMap,
         meta: MapMeta,
         config: AssociationConfig,
-        max_bytes: int = 64 * 2**20,
+        max_bytes: int = POINTS_BYTES,
     ) -> None:
         if meta.range_edges_m:
             raise ConfigError("The dense engine does not count by range (fusion.range_edges_m).")

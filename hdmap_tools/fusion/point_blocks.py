@@ -23,6 +23,9 @@ from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloa
 _MAX_BLOCK_MM: Final = 32_000
 """Positions in a block are 16-bit millimetres: half the bytes to read for each point."""
 
+POINTS_BYTES: Final = 64 * 2**20
+"""Of blocks in memory, where nothing else is said: those around a vehicle take a half of it."""
+
 BlockIndex = tuple[int, int]
 
 
@@ -172,7 +175,7 @@ class PointBlocks:
         max_bytes: Of blocks in memory.
     """
 
-    def __init__(self, points: PointMap, meta: MapMeta, max_bytes: int = 64 * 2**20) -> None:
+    def __init__(self, points: PointMap, meta: MapMeta, max_bytes: int = POINTS_BYTES) -> None:
         self._points, self._meta, self._max_bytes = points, meta, max_bytes
         self._kept: OrderedDict[BlockIndex, PointBlock] = OrderedDict()
         self._num_bytes = 0

@@ -43,10 +43,10 @@ class TilesOnDisk(MutableMapping[TileIndex, Tile]):
     def __setitem__(self, index: TileIndex, tile: Tile) -> None:
         self._forget(index)
         self._recent[index] = tile
-        self._num_bytes += _size_of(tile)
+        self._num_bytes += tile.num_bytes
         while self._num_bytes > self._max_bytes and len(self._recent) > 1:
             oldest, left = self._recent.popitem(last=False)
-            self._num_bytes -= _size_of(left)
+            self._num_bytes -= left.num_bytes
             layers: dict[str, Any] = left.layers
             np.savez(self._path(oldest), **layers)
             self._aside.add(oldest)
@@ -65,12 +65,8 @@ class TilesOnDisk(MutableMapping[TileIndex, Tile]):
     def _forget(self, index: TileIndex) -> None:
         tile = self._recent.pop(index, None)
         if tile is not None:
-            self._num_bytes -= _size_of(tile)
+            self._num_bytes -= tile.num_bytes
         self._aside.discard(index)
 
     def _path(self, index: TileIndex) -> Path:
         return self._folder / f"{index[0]}_{index[1]}.npz"
-
-
-def _size_of(tile: Tile) -> int:
-    return sum(layer.nbytes for layer in tile.layers.values())

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hdmap_tools.ahead import made_ahead
-from hdmap_tools.association.ground import estimate_ground, near_ground
+from hdmap_tools.association.ground import estimate_ground
 from hdmap_tools.association.visibility import ring_gap_deg
 from hdmap_tools.config import PointsConfig
 from hdmap_tools.errors import PointMapError
@@ -205,7 +205,7 @@ def sweep_in_city(posed: PosedDrive, ref: SweepRef, config: PointsConfig) -> Swe
     )
     sweep = Sweep(whole.timestamp_ns, points_ego, whole.intensity[near], whole.ring[near])
     surface = estimate_ground(points_ego, config.max_range_m)
-    is_ground = near_ground(points_ego, surface, config.ground_tolerance_m)
+    is_ground = surface.is_near(points_ego, config.ground_tolerance_m)
     return SweepInCity(sweep, city_SE3_ego, points_city, range_m, is_ground)
 
 

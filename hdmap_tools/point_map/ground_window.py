@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ class GroundHeights:
 
     def __init__(self, points: PointMap) -> None:
         self._points = points
-        self._recent: OrderedDict[TileIndex, NDArrayFloat] = OrderedDict()
+        self._tile = lru_cache(maxsize=_TILES_KEPT)(partial(_ground_of, points))
 
     @property
     def cell_m(self) -> float:
@@ -58,20 +58,12 @@ class GroundHeights:
                 ]
         return heights, (x0, y0)
 
-    def _tile(self, index: TileIndex) -> NDArrayFloat:
-        found = self._recent.pop(index, None)
-        if found is None:
-            found = _to_neighbours(self._points.read_ground(index))
-        self._recent[index] = found
-        if len(self._recent) > _TILES_KEPT:
-            self._recent.popitem(last=False)
-        return found
 
-
-def _to_neighbours(heights: NDArrayFloat) -> NDArrayFloat:
-    """Heights (side, side) with those of cells that have one given to cells near them."""
+def _ground_of(points: PointMap, index: TileIndex) -> NDArrayFloat:
+    """Heights (side, side) of a tile, with those of cells that have one given to cells near them."""
     from scipy.ndimage import distance_transform_edt
 
+    heights = points.read_ground(index)
     unknown = np.isnan(heights)
     if not unknown.any() or unknown.all():
         return heights

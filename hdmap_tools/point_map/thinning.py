@@ -28,7 +28,6 @@ _Z_BIAS: Final = 1 << 23
 
 _MAX_TILES: Final = 1 << 16
 """More tiles than that around some returns are sorted by comparing."""
-_HASH: Final = 0x9E3779B97F4A7C1
 
 _SUMS: Final = 7
 """Weight, weighted x, y, z offsets in the voxel (mm), weighted intensity, hits, ground hits."""
@@ -320,12 +319,17 @@ def _packed(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _hash(key: int) -> int:
+    """Fibonacci hashing; the shifts bring the high bits, which hold the cell, down."""
+    return (key ^ (key >> 29)) * 0x9E3779B97F4A7C1 >> 20
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _fill_slots(slots: NDArrayAny, key: NDArrayInt, used: int) -> None:
     """Put rows into an empty hash table."""
     mask = len(slots) - 1
     for row in range(used):
-        # Fibonacci hashing; the shifts bring the high bits, which hold the cell, down.
-        at = ((key[row] ^ (key[row] >> 29)) * _HASH >> 20) & mask
+        at = _hash(key[row]) & mask
         while slots[at] != _EMPTY:
             at = (at + 1) & mask
         slots[at] = row
@@ -344,7 +348,7 @@ def _add_returns(
     mask = len(slots) - 1
     for i in range(len(wanted)):
         own = wanted[i]
-        at = ((own ^ (own >> 29)) * _HASH >> 20) & mask
+        at = _hash(own) & mask
         while slots[at] != _EMPTY and key[slots[at]] != own:
             at = (at + 1) & mask
         row = int(slots[at])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hdmap_tools.association.ground import GroundedSweep, estimate_ground, near_ground
+from hdmap_tools.association.ground import GroundedSweep, estimate_ground
 from hdmap_tools.errors import ShapeError
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.testing.street import Street, flat, slope, stripes
@@ -14,7 +14,7 @@ def test_ground_points_are_found_and_no_others(height):
     points = Street(height, stripes, BOX).sweep(SE3.identity()).points_ego
     surface = estimate_ground(points)
     true_height = points[:, 2] - height(points[:, 0], points[:, 1])
-    found = near_ground(points, surface, 0.1)
+    found = surface.is_near(points, 0.1)
     within = np.linalg.norm(points[:, :2], axis=1) < 40.0
     assert found[within & (np.abs(true_height) < 0.01)].mean() > 0.97
     assert not found[true_height > 0.25].any()
@@ -63,7 +63,7 @@ def test_no_points_no_ground():
     surface = estimate_ground(np.zeros((0, 3)))
     assert np.isnan(surface.height_at(np.array([[1.0, 1.0]])))
     assert surface.plane() is None
-    assert not near_ground(np.array([[5.0, 0.0, 0.0]]), surface, 0.1)
+    assert not surface.is_near(np.array([[5.0, 0.0, 0.0]]), 0.1)
 
 
 def test_points_of_the_wrong_shape_are_refused():

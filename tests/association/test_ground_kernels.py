@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hdmap_tools.association.ground import GroundSurface, near_ground
+from hdmap_tools.association.ground import GroundSurface
 from hdmap_tools.association.ground_kernels import low_heights, mean_samples, polar_cells
 
 
@@ -73,7 +73,7 @@ def test_points_near_the_ground_are_those_within_the_tolerance(offset):
     points[:5] = [[np.nan, 0, 0], [0, np.inf, 0], [1e9, 1e9, 0], [0, 0, np.nan], [-1e9, 0, 0]]
     with np.errstate(invalid="ignore", over="ignore"):
         expected = near_by_lattice(surface.samples, points[5:], 0.1)
-    found = near_ground(points, surface, 0.1)
+    found = surface.is_near(points, 0.1)
     assert not found[:5].any()
     np.testing.assert_array_equal(found[5:], expected)
     assert 1000 < expected.sum() < 19_000
@@ -90,7 +90,7 @@ def test_between_the_lattice_the_ground_is_the_one_of_each_point():
     points = rng.uniform(-28, 28, (20_000, 3))
     points[:, 2] = height(points[:, :2]) + rng.choice([0.0, 0.05, 0.15, 0.5, -0.2], len(points))
     own = np.abs(points[:, 2] - heights_by_tree(samples, points[:, :2])) <= 0.1
-    assert (near_ground(points, GroundSurface(samples), 0.1) == own).mean() > 0.995
+    assert (GroundSurface(samples).is_near(points, 0.1) == own).mean() > 0.995
 
 
 def test_cells_around_the_vehicle_and_their_means():
