@@ -12,14 +12,16 @@ from typing import Final
 import numpy as np
 from numba import njit
 
+from hdmap_tools.association.visibility import CELL_PX
+from hdmap_tools.fusion.vote_kernels import SLOTS_DIFFER, scratch_for, vote_cells
 from hdmap_tools.types import NDArrayAny, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
-_SLACK: Final = 3e-3
-"""Metres by which culling errs towards more: the float32 tests of each point decide."""
 _ZERO: Final = np.float32(0.0)
 _HALF: Final = np.float32(0.5)
 _ONE: Final = np.float32(1.0)
 _TWO: Final = np.float32(2.0)
+_BIT: Final = np.uint32(1)
+_CELL_PX: Final = np.uint32(CELL_PX)
 _AT_ONCE: Final = 2048
 """Points whose pixels are kept at once: they stay in the fastest cache."""
 
@@ -60,62 +62,15 @@ def in_block(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def rows_in_view(
-    planes: NDArrayFloat,
-    z_range: tuple[float, float],
-    resolution_m: float,
-    row_starts: NDArrayInt,
-    columns: NDArrayInt,
-) -> NDArrayInt:
-    """Cells of each row of a block that may lie within half spaces.
-
-    Args:
-        planes: (P, 4) a, b, c, d in the block's frame, inside where a x + b y + c z + d >= 0.
-        z_range: Lowest and highest point of the block.
-        resolution_m: Edge of a cell.
-        row_starts: (R + 1,) first occupied cell of each row, rows along y.
-        columns: (K,) column of each occupied cell, ascending in each row.
-
-    Returns:
-        (R, 2) half-open ranges of occupied cells.
-    """
-    rows = len(row_starts) - 1
-    found = np.zeros((rows, 2), dtype=np.int64)
-    for row in range(rows):
-        first, last = row_starts[row], row_starts[row + 1]
-        if first == last:
-            continue
-        low, high = -np.inf, np.inf
-        y0, y1 = row * resolution_m, (row + 1) * resolution_m
-        for p in range(len(planes)):
-            a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
-            rest = max(b * y0, b * y1) + max(c * z_range[0], c * z_range[1]) + d + _SLACK
-            if a > 1e-9:
-                low = max(low, -rest / a)
-            elif a < -1e-9:
-                high = min(high, -rest / a)
-            elif rest < 0.0:
-                high = -np.inf
-        if low > high:
-            continue
-        low, high = np.floor(low / resolution_m) - 1.0, np.floor(high / resolution_m) + 1.0
-        while first < last and columns[first] < low:
-            first += 1
-        while last > first and columns[last - 1] > high:
-            last -= 1
-        found[row, 0], found[row, 1] = first, last
-    return found
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _project(
     xs: NDArrayAny,
     ys: NDArrayAny,
-    zs: NDArrayFloat32,
+    zs: NDArrayAny,
     view: NDArrayFloat32,
     width: int,
     height: int,
     pixel: NDArrayAny,
+    cell: NDArrayAny,
     depth: NDArrayFloat32,
     is_distorted: bool,
 ) -> None:
@@ -123,12 +78,13 @@ def _project(
 
     Args:
         xs: With
-        ys: (N,) int16 and
-        zs: (N,) float32 millimetres in the block's frame.
-        view: (36,) as `dense_fusion.FrameView` fills it.
+        ys: and
+        zs: (N,) millimetres in the block's frame.
+        view: (36,) as `view_kernels.view_of_block` fills it.
         width: With
         height: of the image.
         pixel: (N,) int32, filled.
+        cell: (N,) int32, filled: of the depth buffer.
         depth: (N,) filled.
         is_distorted: Whether the lens is more than a pinhole.
     """
@@ -142,9 +98,9 @@ def _project(
     ahead, across, nearest2 = view[29], view[30], view[31]
     camera_x, camera_y, least_depth, radius2 = view[32], view[33], view[34], view[35]
     right, below = np.float32(width), np.float32(height)
-    none = np.int32(width * height)
+    none, columns = np.int32(width * height), np.int32(-(-width // CELL_PX))
     for i in range(len(xs)):
-        x, y, z = np.float32(xs[i]), np.float32(ys[i]), zs[i]
+        x, y, z = np.float32(xs[i]), np.float32(ys[i]), np.float32(zs[i])
         ex = e00 * x + e01 * y + e02 * z + e03
         ey = e10 * x + e11 * y + e12 * z + e13
         d = c20 * x + c21 * y + c22 * z + c23
@@ -166,18 +122,51 @@ def _project(
         ok &= (u >= _ZERO) & (u < right) & (v >= _ZERO) & (v < below)
         gx, gy = ex - camera_x, ey - camera_y
         ok &= gx * gx + gy * gy >= nearest2
-        at = np.int32(v if ok else _ZERO) * np.int32(width) + np.int32(u if ok else _ZERO)
-        pixel[i] = at if ok else none
+        row, column = (
+            np.uint32(np.int32(v if ok else _ZERO)),
+            np.uint32(np.int32(u if ok else _ZERO)),
+        )
+        pixel[i] = np.int32(row) * np.int32(width) + np.int32(column) if ok else none
+        cell[i] = np.int32(row // _CELL_PX) * columns + np.int32(column // _CELL_PX)
         depth[i] = d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def see_block(
-    x: NDArrayAny,
-    y: NDArrayAny,
-    z: NDArrayFloat32,
-    bins: NDArrayAny,
+def _project_inner(
+    xs: NDArrayAny,
+    ys: NDArrayAny,
+    zs: NDArrayAny,
+    view: NDArrayFloat32,
+    width: int,
+    pixel: NDArrayAny,
+    cell: NDArrayAny,
+    depth: NDArrayFloat32,
+) -> None:
+    """`_project` where clip and view hold all points, through a pinhole."""
+    c00, c01, c02, c03 = view[8], view[9], view[10], view[11]
+    c10, c11, c12, c13 = view[12], view[13], view[14], view[15]
+    c20, c21, c22, c23 = view[16], view[17], view[18], view[19]
+    fx, fy, cx, cy = view[20], view[21], view[22], view[23]
+    columns = np.int32(-(-width // CELL_PX))
+    for i in range(len(xs)):
+        x, y, z = np.float32(xs[i]), np.float32(ys[i]), np.float32(zs[i])
+        d = c20 * x + c21 * y + c22 * z + c23
+        inverse = _ONE / d
+        a = (c00 * x + c01 * y + c02 * z + c03) * inverse
+        b = (c10 * x + c11 * y + c12 * z + c13) * inverse
+        u = fx * a + cx + _HALF
+        v = fy * b + cy + _HALF
+        row, column = np.uint32(np.int32(v)), np.uint32(np.int32(u))
+        pixel[i] = np.int32(row) * np.int32(width) + np.int32(column)
+        cell[i] = np.int32(row // _CELL_PX) * columns + np.int32(column // _CELL_PX)
+        depth[i] = d
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def fuse_block(
+    points: tuple[NDArrayAny, NDArrayAny, NDArrayAny, NDArrayAny],
     starts: NDArrayInt,
+    cells: NDArrayInt,
     runs: NDArrayInt,
     view: NDArrayFloat32,
     is_distorted: bool,
@@ -185,73 +174,103 @@ def see_block(
     labels: NDArrayAny,
     slot_of: NDArrayAny,
     hides_from_m: NDArrayFloat32,
-    cell_px: int,
-    slots: NDArrayAny,
+    rule: tuple[int, int, np.uint64],
+    place: tuple[int, int, int],
+    layers: tuple[NDArrayAny, ...],
+    values: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
+    sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
 ) -> int:
-    """The slot that an image gives each ground point of the runs; gives how many it saw.
+    """Project the ground points of runs into an image, look up, and vote; gives how many were seen.
+
+    A few thousand points at a time, from their position to their vote: what lies in between
+    never leaves the fastest cache.
 
     Args:
-        x: With
-        y: (N,) int16 and
-        z: (N,) float32 millimetres in the block's frame, by cell.
-        bins: (N,) uint8 intensity bin.
+        points: x, y, z (N,) millimetres in the block's frame, by cell, and (N,) uint8 intensity bin.
         starts: (K + 1,) first point of each cell.
-        runs: (R, 2) ranges of cells.
+        cells: (K,) flat cell in the tile.
+        runs: (R, 3) of `view_kernels.view_of_block`.
         view: See `_project`.
         is_distorted: See `_project`.
         size_px: Width and height of the image.
         labels: (height * width + 1,) uint8, row by row; the last is that of no pixel.
-        slot_of: (256,) uint16 first slot of each label; 0: it says nothing of the ground.
-        hides_from_m: (rows, columns) depth from which on points are hidden; empty: nothing is.
-        cell_px: Pixels along a cell of it.
-        slots: (N,) uint16, filled in the runs: 1 + channel; 0: not seen.
+        slot_of: (512,) uint16 slot of each label and bin, ``2 * label + bin``; 0: it says nothing
+            of the ground.
+        hides_from_m: (cells,) depth from which on points are hidden, row by row of the depth buffer;
+            empty: nothing is.
+        rule: And
+        place: and
+        layers: and
+        values: and
+        sums: of `vote_cells`.
     """
+    x, y, z, bins = points
     width, height = size_px
-    pixel = np.empty(_AT_ONCE, dtype=np.int32)
-    depth = np.empty(_AT_ONCE, dtype=np.float32)
-    w, px = np.uint32(width), np.uint32(cell_px)
-    tested = hides_from_m.size > 0
-    seen = np.int64(0)
+    scratch = scratch_for(len(layers[0]))
+    room = _AT_ONCE
     for r in range(len(runs)):
-        end = starts[runs[r, 1]]
-        for first in range(starts[runs[r, 0]], end, _AT_ONCE):
-            last = min(first + _AT_ONCE, end)
+        for k in range(runs[r, 0], runs[r, 1]):
+            room = max(room, starts[k + 1] - starts[k])
+    pixel = np.empty(room, dtype=np.int32)
+    hide_cell = np.empty(room, dtype=np.int32)
+    depth = np.empty(room, dtype=np.float32)
+    slots = np.empty(room, dtype=np.uint16)
+    alike = np.empty(room, dtype=np.uint16)
+    tested = len(hides_from_m) > 0
+    seen = 0
+    for r in range(len(runs)):
+        k1 = runs[r, 0]
+        while k1 < runs[r, 1]:
+            k0, first = k1, starts[k1]
+            k1 += 1
+            while k1 < runs[r, 1] and starts[k1 + 1] - first <= _AT_ONCE:
+                k1 += 1
+            last = starts[k1]
             xs, ys, zs = x[first:last], y[first:last], z[first:last]
-            _project(xs, ys, zs, view, width, height, pixel, depth, is_distorted)
-            found, own = slots[first:last], bins[first:last]
-            if not tested:
-                for i in range(len(xs)):
-                    slot = slot_of[labels[np.uint32(pixel[i])]]
-                    slot = slot + np.uint16(own[i]) if slot > 0 else np.uint16(0)
-                    found[i] = slot
-                    seen += slot > 0
-                continue
+            if runs[r, 2]:
+                _project_inner(xs, ys, zs, view, width, pixel, hide_cell, depth)
+            else:
+                _project(xs, ys, zs, view, width, height, pixel, hide_cell, depth, is_distorted)
+            own = bins[first:last]
             for i in range(len(xs)):
-                at = np.uint32(pixel[i])
-                slot = slot_of[labels[at]]
-                if slot > 0:
-                    row = at // w
-                    column = at - row * w
-                    if depth[i] > hides_from_m[row // px, column // px]:
-                        slot = np.uint16(0)
-                    else:
-                        slot = slot + np.uint16(own[i])
-                        seen += 1
-                found[i] = slot
-    return int(seen)
+                label = np.uint32(labels[np.uint32(pixel[i])])
+                slots[i] = slot_of[(label << _BIT) | np.uint32(own[i])]
+            if tested:
+                for i in range(len(xs)):
+                    if depth[i] > hides_from_m[np.uint32(hide_cell[i])]:
+                        slots[i] = np.uint16(0)
+            for k in range(k0, k1):
+                begin, end = starts[k] - first, starts[k + 1] - first
+                slot, differing = slots[begin], np.uint16(0)
+                for i in range(begin, end):
+                    differing = np.uint16(differing | (slots[i] ^ slot))
+                alike[k - k0] = SLOTS_DIFFER if differing else slot
+            seen += vote_cells(
+                k0,
+                k1,
+                starts,
+                cells,
+                (slots, alike, first),
+                rule,
+                place,
+                layers,
+                values,
+                sums,
+                scratch,
+            )
+    return seen
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def lay_block(
     x: NDArrayAny,
     y: NDArrayAny,
-    z: NDArrayFloat32,
+    z: NDArrayAny,
     starts: NDArrayInt,
     runs: NDArrayInt,
     view: NDArrayFloat32,
     is_distorted: bool,
     size_px: tuple[int, int],
-    cell_px: int,
     nearest_m: float,
     buffer: NDArrayFloat32,
 ) -> None:
@@ -264,27 +283,25 @@ def lay_block(
         starts: and
         runs: and
         view: (with a least range of 0, for what is near hides too) and
-        is_distorted: as of `see_block`.
-        cell_px: Pixels along a cell of the buffer.
+        is_distorted: as of `fuse_block`.
         size_px: Width and height of the image.
         nearest_m: What is nearer belongs to the vehicle.
-        buffer: (rows, columns) changed: the nearest depth.
+        buffer: (cells,) row by row, changed: the nearest depth.
     """
     width, height = size_px
     pixel = np.empty(_AT_ONCE, dtype=np.int32)
+    cell = np.empty(_AT_ONCE, dtype=np.int32)
     depth = np.empty(_AT_ONCE, dtype=np.float32)
-    none, w, px = np.uint32(width * height), np.uint32(width), np.uint32(cell_px)
+    none = np.int32(width * height)
     for r in range(len(runs)):
         end = starts[runs[r, 1]]
         for first in range(starts[runs[r, 0]], end, _AT_ONCE):
             last = min(first + _AT_ONCE, end)
             xs, ys, zs = x[first:last], y[first:last], z[first:last]
-            _project(xs, ys, zs, view, width, height, pixel, depth, is_distorted)
+            _project(xs, ys, zs, view, width, height, pixel, cell, depth, is_distorted)
             for i in range(len(xs)):
-                at = np.uint32(pixel[i])
-                if at == none or depth[i] <= nearest_m:
+                if pixel[i] == none or depth[i] <= nearest_m:
                     continue
-                row = at // w
-                row, column = row // px, (at - row * w) // px
-                if depth[i] < buffer[row, column]:
-                    buffer[row, column] = depth[i]
+                at = np.uint32(cell[i])
+                if depth[i] < buffer[at]:
+                    buffer[at] = depth[i]

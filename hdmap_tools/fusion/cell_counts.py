@@ -20,7 +20,7 @@ from hdmap_tools.errors import LabelError, MapMismatchError, ShapeError
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.vote_kernels import MODES, by_tile_and_cell, vote
 from hdmap_tools.geometry.grid import BevGrid, cells_of
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayFloat
 
 TILE_CELLS: Final = 256
 """Cells a side of a tile, which is also a chunk of the store."""
@@ -41,7 +41,12 @@ LAYERS: Final[dict[str, type[np.integer[Any]]]] = {
 }
 """Name and dtype of each layer. Heights in whole millimetres above the map's reference height."""
 
+_NO_SUMS: Final = (np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint64))
+
 TileIndex = tuple[int, int]
+
+Ballot = tuple[tuple[int, int, np.uint64], tuple[int, int, int], tuple[NDArrayAny, ...]]
+"""Rule, place and layers of `vote_kernels.vote_cells`."""
 
 
 @dataclass(eq=False)
@@ -155,63 +160,20 @@ class CellCounts:
         slots = (1 + observations.labels * np.int32(num_bins) + bins).astype(np.uint16)
         height_mm = heights_in_mm(observations.points_city[:, 2], self.meta)
         for index, order, starts, flat in by_tile_and_cell(cells, TILE_CELLS):
-            self.vote(
-                index,
-                (np.array([[0, len(flat)]]), starts, flat),
-                slots[order],
-                frame_key,
-                height_mm[order],
-                intensity[order],
-                has_intensity[order],
-            )
+            values = (height_mm[order], intensity[order], has_intensity[order])
+            whole = np.array([[0, len(flat)]])
+            ballot = self.ballot(index, frame_key)
+            vote(whole, starts, flat, slots[order], *ballot, values, _NO_SUMS)
 
-    def vote(
-        self,
-        index: TileIndex,
-        cells: tuple[NDArrayInt, NDArrayInt, NDArrayInt],
-        slots: NDArrayAny,
-        frame_key: int,
-        height_mm: NDArrayInt,
-        intensity: NDArrayByte,
-        has_intensity: NDArrayAny | None = None,
-        sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny] | None = None,
-    ) -> None:
-        """Add the votes of (part of) one frame in cells of one tile.
-
-        All points that the frame has in a cell must come at once; `num_frames` is not changed.
-
-        Args:
-            index: Of the tile.
-            cells: Ranges (R, 2) of cells, first point (K + 1,) of each cell, and the cell
-                (K,) in the tile, ``y * TILE_CELLS + x``.
-            slots: (N,) uint16 ``1 + label * num_bins + bin``; 0 where nothing was seen.
-            frame_key: Any number that names the frame.
-            height_mm: (N,) int32 above the reference height.
-            intensity: (N,) uint8.
-            has_intensity: (N,) bool; None: all have.
-            sums: By cell, of all points: height, its square, intensity; saves adding up.
-        """
-        layers = self._tile(index).layers
-        runs, starts, flat = cells
-        if sums is None:
-            sums = (np.zeros(0, np.int64), np.zeros(0, np.uint64), np.zeros(0, np.uint64))
-        vote(
-            runs,
-            starts,
-            flat,
-            (index[0] * TILE_CELLS, index[1] * TILE_CELLS),
-            TILE_CELLS,
-            slots,
-            self.meta.num_bins,
-            MODES[self.meta.count_mode],
-            np.uint64(frame_key & 0xFFFFFFFFFFFFFFFF),
-            height_mm,
-            intensity,
-            np.zeros(0, dtype=bool) if has_intensity is None else has_intensity,
-            sums,
-            layers["counts"].reshape(-1, TILE_CELLS * TILE_CELLS),
-            tuple(layers[f"height_{name}"].reshape(-1) for name in ("n", "sum", "sum_sq")),
-            tuple(layers[f"intensity_{name}"].reshape(-1) for name in ("n", "sum")),
+    def ballot(self, index: TileIndex, frame_key: int) -> Ballot:
+        """Where and how kernels cast a frame's votes in a tile: rule, place and layers of `vote_cells`."""
+        cells = TILE_CELLS * TILE_CELLS
+        counts, *layers = (self._tile(index).layers[name] for name in LAYERS)
+        key = np.uint64(frame_key & 0xFFFFFFFFFFFFFFFF)
+        return (
+            (self.meta.num_bins, MODES[self.meta.count_mode], key),
+            (index[0] * TILE_CELLS, index[1] * TILE_CELLS, TILE_CELLS),
+            (counts.reshape(-1, cells), *(layer.reshape(-1) for layer in layers)),
         )
 
     def merge(self, other: CellCounts) -> CellCounts:

@@ -7,28 +7,27 @@ passed over by the row; what is left is projected in one vector loop, looked up,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from hdmap_tools.association.dense import MAP_GAP_DEG, clip_bounds_m, sweep_hides_from_m
 from hdmap_tools.association.lookup import speaks_of_ground
-from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, depth_shape, widened
+from hdmap_tools.association.visibility import MARGIN_M, NEAREST_M, depth_shape, widened
 from hdmap_tools.config import AssociationConfig
 from hdmap_tools.errors import ConfigError
-from hdmap_tools.fusion.block_kernels import lay_block, rows_in_view, see_block
+from hdmap_tools.fusion.block_kernels import fuse_block, lay_block
 from hdmap_tools.fusion.cell_counts import CellCounts
+from hdmap_tools.fusion.frame_view import FrameView
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.point_blocks import POINTS_BYTES, PointBlock, PointBlocks, SortedPoints
-from hdmap_tools.geometry.camera import MIN_DEPTH_M, PinholeCamera
+from hdmap_tools.fusion.point_blocks import POINTS_BYTES, PointBlock, PointBlocks
+from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import IGNORE_ID, LabelSet
 from hdmap_tools.point_map.point_map import PointMap
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32
 
-_CULLING_MARGIN_PX: Final = 1.0
-"""Cells are passed over where they lie so far outside of the image: float32 rounds by much less."""
+_ALL_MEASURED: Final = np.zeros(0, dtype=bool)
 
 
 class DenseFusion:
@@ -59,7 +58,6 @@ class DenseFusion:
         self.meta, self._config = meta, config
         self._blocks = PointBlocks(points, meta, max_bytes)
         self._slot_of = slots_of(meta.label_set)
-        self._slots = np.zeros(0, dtype=np.uint16)
         self._labels = np.zeros(0, dtype=np.uint8)
 
     def add(
@@ -98,36 +96,28 @@ class DenseFusion:
                 hides = np.minimum(hides, live.astype(np.float32))
         total = 0
         for block in blocks:
-            ground, view = block.ground, frame.from_block(block.corner_city)
-            runs = view.runs(ground, self.meta.resolution_m)
-            slots = self._scratch(len(ground))
-            seen = see_block(
-                ground.x,
-                ground.y,
-                ground.z,
-                block.bins,
-                ground.starts,
-                runs,
-                view.numbers,
-                camera.is_distorted,
-                size_px,
-                labels,
-                self._slot_of,
-                hides,
-                CELL_PX,
-                slots,
-            )
-            if seen:
-                total += seen
-                counts.vote(
-                    block.tile,
-                    (runs, ground.starts, ground.cells),
-                    slots,
-                    frame_key,
-                    block.height_mm,
-                    block.intensity,
-                    sums=block.sums,
+            ground = block.ground
+            view, runs = frame.of_block(ground, block.corner_city, self.meta.resolution_m)
+            if len(runs):
+                is_new = block.tile not in counts.tiles
+                seen = fuse_block(
+                    (ground.x, ground.y, ground.z, block.bins),
+                    ground.starts,
+                    ground.cells,
+                    runs,
+                    view,
+                    camera.is_distorted,
+                    size_px,
+                    labels,
+                    self._slot_of,
+                    hides.ravel(),
+                    *counts.ballot(block.tile, frame_key),
+                    (block.height_mm, block.intensity, _ALL_MEASURED),
+                    block.sums,
                 )
+                total += seen
+                if is_new and not seen:
+                    del counts.tiles[block.tile]
         return total
 
     def _hides_from_m(
@@ -137,21 +127,21 @@ class DenseFusion:
         depth = np.full(depth_shape(camera), np.inf, dtype=np.float32)
         frame = frame.from_anywhere()
         for block in blocks:
-            standing, view = block.standing, frame.from_block(block.corner_city)
-            if len(standing) == 0:
+            standing = block.standing
+            view, runs = frame.of_block(standing, block.corner_city, self.meta.resolution_m)
+            if len(runs) == 0:
                 continue
             lay_block(
                 standing.x,
                 standing.y,
                 standing.z,
                 standing.starts,
-                view.runs(standing, self.meta.resolution_m),
-                view.numbers,
+                runs,
+                view,
                 camera.is_distorted,
                 (camera.width_px, camera.height_px),
-                CELL_PX,
                 NEAREST_M,
-                depth,
+                depth.ravel(),
             )
         return widened(depth, camera, MAP_GAP_DEG, MAP_GAP_DEG) + np.float32(MARGIN_M)
 
@@ -162,101 +152,9 @@ class DenseFusion:
         self._labels[:-1].reshape(label_image.shape)[:] = label_image
         return self._labels
 
-    def _scratch(self, size: int) -> NDArrayAny:
-        if len(self._slots) < size:
-            self._slots = np.empty(size, dtype=np.uint16)
-        return self._slots[:size]
 
-
-def slots_of(label_set: LabelSet, num_bins: int = 2) -> NDArrayAny:
-    """(256,) uint16 one plus the first channel of each label id; 0 where it says nothing of the ground."""
+def slots_of(label_set: LabelSet) -> NDArrayAny:
+    """(512,) uint16 by ``2 * label + bin``: one plus the channel; 0 where the label says nothing of the ground."""
     ids = np.arange(256, dtype=np.uint8)
     speaks = speaks_of_ground(ids, label_set) & (ids < len(label_set))
-    return np.where(speaks, 1 + ids.astype(np.int64) * num_bins, 0).astype(np.uint16)
-
-
-@dataclass(frozen=True, eq=False)
-class FrameView:
-    """A camera's view at a pose.
-
-    Attributes:
-        rows: (5, 4) from the city into the ego frame (rows 0 and 1) and the camera's (2 to 4).
-        lens: (16,) fx, fy, cx, cy, k1, k2, p1, p2, k3, the clip (ahead, across, square of the
-            least range), the camera's place in the ego frame (x, y), the least depth, and the
-            square of the lens' radius.
-        planes: (P, 4) half spaces of the city that hold clip and view.
-    """
-
-    rows: NDArrayFloat
-    lens: NDArrayFloat
-    planes: NDArrayFloat
-
-    @classmethod
-    def of(cls, camera: PinholeCamera, city_SE3_ego: SE3, config: AssociationConfig) -> FrameView:
-        """From an ego pose."""
-        ego, cam = city_SE3_ego.inverse(), (city_SE3_ego @ camera.ego_SE3_cam).inverse()
-        rows = np.column_stack(
-            [
-                np.concatenate([ego.rotation[:2], cam.rotation]),
-                np.concatenate([ego.translation[:2], cam.translation]),
-            ]
-        )
-        lens, (width, height), radius = camera.lens
-        place = camera.ego_SE3_cam.translation
-        clip = (config.clip_ahead_m, config.clip_across_m, config.min_range_m**2)
-        ahead, left, right, down, depth = rows
-        one = np.array([0.0, 0.0, 0.0, 1.0])
-        planes = [
-            ahead,
-            config.clip_ahead_m * one - ahead,
-            config.clip_across_m * one - left,
-            config.clip_across_m * one + left,
-            depth - MIN_DEPTH_M * one,
-        ]
-        if not camera.is_distorted:
-            fx, fy, cx, cy = lens[:4]
-            margin = 0.5 + _CULLING_MARGIN_PX
-            planes += [
-                fx * right + (cx + margin) * depth,
-                fy * down + (cy + margin) * depth,
-                (width - 1 + margin - cx) * depth - fx * right,
-                (height - 1 + margin - cy) * depth - fy * down,
-            ]
-        numbers = np.array([*lens, *clip, place[0], place[1], MIN_DEPTH_M, radius**2])
-        return cls(rows, numbers, np.array(planes))
-
-    def from_anywhere(self) -> FrameView:
-        """The same without a least range."""
-        lens = self.lens.copy()
-        lens[11] = 0.0
-        return FrameView(self.rows, lens, self.planes)
-
-    def from_block(self, corner_city: NDArrayFloat) -> BlockView:
-        """The same for positions that count from a place."""
-        rows, planes = self.rows.copy(), self.planes.copy()
-        rows[:, 3] += rows[:, :3] @ corner_city
-        rows[:, :3] /= 1000.0  # points of blocks are in millimetres
-        planes[:, 3] += planes[:, :3] @ corner_city
-        with np.errstate(over="ignore"):  # the radius of a pinhole is infinite
-            numbers = np.concatenate([rows.ravel(), self.lens]).astype(np.float32)
-        return BlockView(numbers, planes)
-
-
-@dataclass(frozen=True, eq=False)
-class BlockView:
-    """A camera's view of a block.
-
-    Attributes:
-        numbers: (36,) float32, rows (from millimetres to metres) and lens of `FrameView`.
-        planes: (P, 4) half spaces in the block's frame, metres.
-    """
-
-    numbers: NDArrayFloat32
-    planes: NDArrayFloat
-
-    def runs(self, points: SortedPoints, resolution_m: float) -> NDArrayInt:
-        """(R, 2) ranges of cells that may be seen."""
-        found: NDArrayInt = rows_in_view(
-            self.planes, points.z_range_m, resolution_m, points.row_starts, points.columns
-        )
-        return found
+    return np.where(speaks.repeat(2), 1 + np.arange(512), 0).astype(np.uint16)

@@ -18,7 +18,7 @@ from hdmap_tools.fusion.cell_counts import TILE_CELLS, TileIndex, heights_in_mm
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.point_map.point_map import PointMap
 from hdmap_tools.point_map.values import MapPoints
-from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayFloat32, NDArrayInt
+from hdmap_tools.types import NDArrayAny, NDArrayByte, NDArrayFloat, NDArrayInt
 
 _MAX_BLOCK_MM: Final = 32_000
 """Positions in a block are 16-bit millimetres: half the bytes to read for each point."""
@@ -43,7 +43,7 @@ class SortedPoints:
 
     Attributes:
         x, y: (N,) int16 millimetres from the block's corner.
-        z: (N,) float32 millimetres from its height.
+        z: (N,) int16 millimetres from its height; float32 where some lie 32 m above or below.
         starts: (K + 1,) first point of each occupied cell.
         cells: (K,) flat cell in the map's tile, ``y * TILE_CELLS + x``.
         columns: (K,) column of the cell in the block.
@@ -53,7 +53,7 @@ class SortedPoints:
 
     x: NDArrayAny
     y: NDArrayAny
-    z: NDArrayFloat32
+    z: NDArrayAny
     starts: NDArrayInt
     cells: NDArrayInt
     columns: NDArrayInt
@@ -83,16 +83,17 @@ class SortedPoints:
         rows, columns = np.divmod(occupied, side)
         in_tile = np.array(index) % (TILE_CELLS // side) * side
         x, y, z = (local_mm[order, axis] for axis in range(3))
-        heights = (float(z.min()) / 1000.0, float(z.max()) / 1000.0) if len(z) else (0.0, 0.0)
+        lowest, highest = (int(z.min()), int(z.max())) if len(z) else (0, 0)
+        fits = lowest >= -(2**15) and highest < 2**15
         return cls(
             x.astype(np.int16),
             y.astype(np.int16),
-            z.astype(np.float32),
+            z.astype(np.int16 if fits else np.float32),
             starts,
             (rows + in_tile[1]) * TILE_CELLS + columns + in_tile[0],
             columns,
             np.searchsorted(rows, np.arange(side + 1)),
-            heights,
+            (lowest / 1000.0, highest / 1000.0),
         ), order
 
 
@@ -163,7 +164,7 @@ class PointBlock:
     @property
     def num_bytes(self) -> int:
         """Memory that it takes, roughly."""
-        return 15 * len(self.ground) + 8 * len(self.standing) + 48 * len(self.ground.cells)
+        return 12 * len(self.ground) + 6 * len(self.standing) + 48 * len(self.ground.cells)
 
 
 class PointBlocks:

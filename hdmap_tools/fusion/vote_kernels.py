@@ -31,6 +31,9 @@ _30: Final = np.uint64(30)
 _27: Final = np.uint64(27)
 _31: Final = np.uint64(31)
 
+SLOTS_DIFFER: Final = np.uint16(65535)
+"""In place of the slot that all points of a cell have, where they do not."""
+
 _MAX_TILES: Final = 64
 """More tiles than that at once are sorted by comparing: counts would take 16 MB and more."""
 
@@ -83,187 +86,239 @@ def _hash(ix: int, iy: int, channel: int, key: np.uint64) -> np.uint64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def scratch_for(num_channels: int) -> tuple[NDArrayAny, ...]:
+    """What `vote_cells` writes into while it counts."""
+    return (
+        np.zeros((4, num_channels + 1), dtype=np.uint32),
+        np.zeros(num_channels, dtype=np.int64),
+        np.empty(num_channels, dtype=np.int64),
+        np.empty(num_channels, dtype=np.uint64),
+        np.empty(num_channels, dtype=np.int64),
+        np.empty(num_channels, dtype=np.int64),
+    )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def vote(
     runs: NDArrayInt,
     starts: NDArrayInt,
     cells: NDArrayInt,
-    corner: tuple[int, int],
-    side: int,
     slots: NDArrayAny,
-    num_bins: int,
-    mode: int,
-    key: np.uint64,
-    height_mm: NDArrayAny,
-    intensity: NDArrayByte,
-    has_intensity: NDArrayAny,
+    rule: tuple[int, int, np.uint64],
+    place: tuple[int, int, int],
+    layers: tuple[NDArrayAny, ...],
+    values: tuple[NDArrayAny, NDArrayByte, NDArrayAny],
     sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
-    counts: NDArrayAny,
-    heights: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
-    intensities: tuple[NDArrayAny, NDArrayAny],
 ) -> None:
     """Add the votes of one frame to a tile, and sums of height and intensity.
 
     Args:
         runs: (R, 2) ranges of cells to look at.
+        starts: With
+        cells: of the cells,
+        slots: (N,) of their points,
+        rule: and
+        place: and
+        layers: and
+        values: and
+        sums: as of `vote_cells`.
+    """
+    scratch = scratch_for(len(layers[0]))
+    alike = np.empty(len(cells), dtype=np.uint16)
+    for r in range(len(runs)):
+        for k in range(runs[r, 0], runs[r, 1]):
+            differing, first = np.uint16(0), slots[starts[k]]
+            for i in range(starts[k], starts[k + 1]):
+                differing = np.uint16(differing | (slots[i] ^ first))
+            alike[k] = SLOTS_DIFFER if differing else first
+        found = (slots, alike[runs[r, 0] :], 0)
+        vote_cells(
+            runs[r, 0],
+            runs[r, 1],
+            starts,
+            cells,
+            found,
+            rule,
+            place,
+            layers,
+            values,
+            sums,
+            scratch,
+        )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def vote_cells(
+    first_cell: int,
+    last_cell: int,
+    starts: NDArrayInt,
+    cells: NDArrayInt,
+    found: tuple[NDArrayAny, NDArrayAny, int],
+    rule: tuple[int, int, np.uint64],
+    place: tuple[int, int, int],
+    layers: tuple[NDArrayAny, ...],
+    values: tuple[NDArrayAny, NDArrayByte, NDArrayAny],
+    sums: tuple[NDArrayAny, NDArrayAny, NDArrayAny],
+    scratch: tuple[NDArrayAny, ...],
+) -> int:
+    """Add the votes of one frame in a range of cells; gives how many points were seen.
+
+    Args:
+        first_cell: With
+        last_cell: the half-open range.
         starts: (K + 1,) first point of each cell.
         cells: (K,) flat cell in the tile, ``y * side + x``.
-        corner: Lattice cell (ix, iy) of the tile's first.
-        side: Cells a side of the tile.
-        slots: (N,) uint16 ``1 + label * num_bins + bin`` of each point, by cell; 0: not seen.
-        num_bins: Bins of a label.
-        mode: One of `MODES`.
-        key: Names the frame; breaks ties.
-        height_mm: (N,) int32 above the map's reference.
-        intensity: (N,) uint8.
-        has_intensity: (N,) bool, or empty: all have.
+        found: Slots (M,) uint16, ``1 + label * num_bins + bin``, of points by cell, 0 not seen; the
+            slot (L,) that all points of a cell have or `SLOTS_DIFFER`, from the first cell on; and
+            the point that the first of the slots is of.
+        rule: Bins of a label; one of `MODES`; what names the frame, to break ties.
+        place: Lattice cell (ix, iy) of the tile's first, and cells a side of the tile.
+        layers: Changed: counts (channels, side * side); number, sum and sum of squares of
+            heights, number and sum of intensities (side * side).
+        values: (N,) int32 height above the map's reference, millimetres; (N,) uint8 intensity;
+            (N,) bool which have one, or empty: all.
         sums: (K,) each, of all points of a cell: height, its square, intensity; or empty.
-        counts: (channels, side * side) changed, as are
-        heights: number, sum and sum of squares (side * side), and
-        intensities: number and sum.
+        scratch: Of `scratch_for`.
     """
+    num_bins, mode, key = rule
+    height_mm, intensity, has_intensity = values
+    height_sums, square_sums, intensity_sums = sums
+    counts, height_n, height_sum, height_sum_sq, intensity_n, intensity_sum = layers
+    slots, alike, base = found
+    tally, points, touched, chance, quanta, remainder = scratch
+    tally0, tally1, tally2, tally3 = tally[0], tally[1], tally[2], tally[3]
     num_channels = len(counts)
     crowded = max(2 * num_channels, 16)
     one, zero = np.uint32(1), np.uint32(0)
-    tally0, tally1 = np.zeros(num_channels + 1, np.uint32), np.zeros(num_channels + 1, np.uint32)
-    tally2, tally3 = np.zeros(num_channels + 1, np.uint32), np.zeros(num_channels + 1, np.uint32)
-    points = np.zeros(num_channels, dtype=np.int64)
-    touched = np.empty(num_channels, dtype=np.int64)
-    chance = np.empty(num_channels, dtype=np.uint64)
-    quanta = np.empty(num_channels, dtype=np.int64)
-    remainder = np.empty(num_channels, dtype=np.int64)
-    height_sums, square_sums, intensity_sums = sums
-    height_n, height_sum, height_sum_sq = heights
-    intensity_n, intensity_sum = intensities
     has_sums, all_measured = len(height_sums) > 0, len(has_intensity) == 0
-    for r in range(len(runs)):
-        for k in range(runs[r, 0], runs[r, 1]):
-            first, last = starts[k], starts[k + 1]
-            count = last - first
-            if count == 0:
-                continue
-            here = slots[first:last]
-            num, seen = 0, np.int64(0)
-            # Most cells lie within one thing: a loop without a branch says so.
-            alike, differing = here[0], 0
-            for i in range(count):
-                differing += here[i] != alike
-            if differing == 0:
-                if alike > 0:
-                    touched[0], points[alike - 1] = np.int64(alike) - 1, count
-                    num, seen = 1, np.int64(count)
-            elif count >= crowded:
-                # Four tallies side by side: the next count need not wait for the last.
-                for i in range(count // 4):
-                    tally0[here[4 * i]] += one
-                    tally1[here[4 * i + 1]] += one
-                    tally2[here[4 * i + 2]] += one
-                    tally3[here[4 * i + 3]] += one
-                for i in range(count - count % 4, count):
-                    tally0[here[i]] += one
-                for slot in range(num_channels + 1):
-                    total = np.int64(tally0[slot] + tally1[slot] + tally2[slot] + tally3[slot])
-                    if total > 0:
-                        tally0[slot] = tally1[slot] = tally2[slot] = tally3[slot] = zero
-                        if slot > 0:
-                            touched[num], points[slot - 1] = slot - 1, total
-                            num += 1
-                            seen += total
-            else:
-                for i in range(count):
-                    channel = np.int64(here[i]) - 1
-                    if channel < 0:
-                        continue
-                    if points[channel] == 0:
-                        touched[num] = channel
+    in_all = np.int64(0)
+    for k in range(first_cell, last_cell):
+        first, last = starts[k], starts[k + 1]
+        count = last - first
+        if count == 0:
+            continue
+        here = slots[first - base : last - base]
+        num, seen = 0, np.int64(0)
+        same = alike[k - first_cell]
+        if same != SLOTS_DIFFER:
+            if same > 0:
+                touched[0], points[same - 1] = np.int64(same) - 1, count
+                num, seen = 1, np.int64(count)
+        elif count >= crowded:
+            # Four tallies side by side: the next count need not wait for the last.
+            for i in range(count // 4):
+                tally0[here[4 * i]] += one
+                tally1[here[4 * i + 1]] += one
+                tally2[here[4 * i + 2]] += one
+                tally3[here[4 * i + 3]] += one
+            for i in range(count - count % 4, count):
+                tally0[here[i]] += one
+            for slot in range(num_channels + 1):
+                total = np.int64(tally0[slot] + tally1[slot] + tally2[slot] + tally3[slot])
+                if total > 0:
+                    tally0[slot] = tally1[slot] = tally2[slot] = tally3[slot] = zero
+                    if slot > 0:
+                        touched[num], points[slot - 1] = slot - 1, total
                         num += 1
-                    points[channel] += 1
-                    seen += 1
-            if num == 0:
-                continue
-            cell = cells[k]
-            ix = iy = 0
-            if num > 1:  # only then may there be a tie; a division takes as long as many points
-                ix, iy = corner[0] + cell % side, corner[1] + cell // side
-            if mode == POINT:
-                for j in range(num):
-                    counts[touched[j], cell] += np.uint32(points[touched[j]])
-            elif num == 1:
-                counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == SHARE else 1)
-            elif mode == SHARE:
-                left = SHARE_QUANTA
-                for j in range(num):
-                    channel = touched[j]
-                    # 32 bits divide in half the time; 2**28 points in a cell are none of ours.
-                    share = np.uint32(SHARE_QUANTA * points[channel])
-                    quanta[j] = np.int64(share // np.uint32(seen))
-                    remainder[j] = np.int64(share) - quanta[j] * seen
-                    chance[j] = _hash(ix, iy, channel, key)
-                    left -= quanta[j]
-                for _ in range(left):
-                    best = -1
-                    for j in range(num):
-                        if remainder[j] < 0:
-                            continue
-                        if (
-                            best < 0
-                            or remainder[j] > remainder[best]
-                            or (remainder[j] == remainder[best] and chance[j] < chance[best])
-                        ):
-                            best = j
-                    quanta[best] += 1
-                    remainder[best] = -1
-                for j in range(num):
-                    counts[touched[j], cell] += np.uint32(quanta[j])
-            else:
-                won, won_points, won_chance = -1, 0, np.uint64(0)
-                for j in range(num):
-                    label = touched[j] // num_bins
-                    is_first = True
-                    for i in range(j):
-                        if touched[i] // num_bins == label:
-                            is_first = False
-                    if not is_first:
-                        continue
-                    best, total = touched[j], points[touched[j]]
-                    for i in range(j + 1, num):
-                        other = touched[i]
-                        if other // num_bins != label:
-                            continue
-                        total += points[other]
-                        if points[other] > points[best] or (
-                            points[other] == points[best]
-                            and _hash(ix, iy, other, key) < _hash(ix, iy, best, key)
-                        ):
-                            best = other
-                    if mode == FRAME:
-                        counts[best, cell] += np.uint32(1)
-                        continue
-                    luck = _hash(ix, iy, label, key)
-                    if total > won_points or (total == won_points and luck < won_chance):
-                        won, won_points, won_chance = best, total, luck
-                if mode == MAJORITY:
-                    counts[won, cell] += np.uint32(1)
-            for j in range(num):
-                points[touched[j]] = 0
-            height_n[cell] += np.uint32(seen)
-            if has_sums and seen == count:
-                height_sum[cell] += height_sums[k]
-                height_sum_sq[cell] += square_sums[k]
-                intensity_n[cell] += np.uint32(count)
-                intensity_sum[cell] += intensity_sums[k]
-                continue
-            total_h, total_sq, total_i = np.int64(0), np.int64(0), np.int64(0)
-            measured = 0
-            for i in range(first, last):
-                if slots[i] == 0:
+                        seen += total
+        else:
+            for i in range(count):
+                channel = np.int64(here[i]) - 1
+                if channel < 0:
                     continue
-                h = np.int64(height_mm[i])
-                total_h += h
-                total_sq += h * h
-                if all_measured or has_intensity[i]:
-                    measured += 1
-                    total_i += np.int64(intensity[i])
-            height_sum[cell] += total_h
-            height_sum_sq[cell] += np.uint64(total_sq)
-            intensity_n[cell] += np.uint32(measured)
-            intensity_sum[cell] += np.uint64(total_i)
+                if points[channel] == 0:
+                    touched[num] = channel
+                    num += 1
+                points[channel] += 1
+                seen += 1
+        if num == 0:
+            continue
+        cell = cells[k]
+        ix = iy = 0
+        if num > 1:  # only then may there be a tie; a division takes as long as many points
+            ix, iy = place[0] + cell % place[2], place[1] + cell // place[2]
+        if mode == POINT:
+            for j in range(num):
+                counts[touched[j], cell] += np.uint32(points[touched[j]])
+        elif num == 1:
+            counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == SHARE else 1)
+        elif mode == SHARE:
+            left = SHARE_QUANTA
+            for j in range(num):
+                channel = touched[j]
+                # 32 bits divide in half the time; 2**28 points in a cell are none of ours.
+                share = np.uint32(SHARE_QUANTA * points[channel])
+                quanta[j] = np.int64(share // np.uint32(seen))
+                remainder[j] = np.int64(share) - quanta[j] * seen
+                chance[j] = _hash(ix, iy, channel, key)
+                left -= quanta[j]
+            for _ in range(left):
+                best = -1
+                for j in range(num):
+                    if remainder[j] < 0:
+                        continue
+                    if (
+                        best < 0
+                        or remainder[j] > remainder[best]
+                        or (remainder[j] == remainder[best] and chance[j] < chance[best])
+                    ):
+                        best = j
+                quanta[best] += 1
+                remainder[best] = -1
+            for j in range(num):
+                counts[touched[j], cell] += np.uint32(quanta[j])
+        else:
+            won, won_points, won_chance = -1, 0, np.uint64(0)
+            for j in range(num):
+                label = touched[j] // num_bins
+                is_first = True
+                for i in range(j):
+                    if touched[i] // num_bins == label:
+                        is_first = False
+                if not is_first:
+                    continue
+                best, total = touched[j], points[touched[j]]
+                for i in range(j + 1, num):
+                    other = touched[i]
+                    if other // num_bins != label:
+                        continue
+                    total += points[other]
+                    if points[other] > points[best] or (
+                        points[other] == points[best]
+                        and _hash(ix, iy, other, key) < _hash(ix, iy, best, key)
+                    ):
+                        best = other
+                if mode == FRAME:
+                    counts[best, cell] += np.uint32(1)
+                    continue
+                luck = _hash(ix, iy, label, key)
+                if total > won_points or (total == won_points and luck < won_chance):
+                    won, won_points, won_chance = best, total, luck
+            if mode == MAJORITY:
+                counts[won, cell] += np.uint32(1)
+        for j in range(num):
+            points[touched[j]] = 0
+        in_all += seen
+        height_n[cell] += np.uint32(seen)
+        if has_sums and seen == count:
+            height_sum[cell] += height_sums[k]
+            height_sum_sq[cell] += square_sums[k]
+            intensity_n[cell] += np.uint32(count)
+            intensity_sum[cell] += intensity_sums[k]
+            continue
+        total_h, total_sq, total_i = np.int64(0), np.int64(0), np.int64(0)
+        measured = 0
+        for i in range(first, last):
+            if slots[i - base] == 0:
+                continue
+            h = np.int64(height_mm[i])
+            total_h += h
+            total_sq += h * h
+            if all_measured or has_intensity[i]:
+                measured += 1
+                total_i += np.int64(intensity[i])
+        height_sum[cell] += total_h
+        height_sum_sq[cell] += np.uint64(total_sq)
+        intensity_n[cell] += np.uint32(measured)
+        intensity_sum[cell] += np.uint64(total_i)
+    return int(in_all)

@@ -10,7 +10,8 @@ from hdmap_tools.association.dense import MAP_GAP_DEG
 from hdmap_tools.association.observations import Observations
 from hdmap_tools.association.visibility import CELL_PX, MARGIN_M, NEAREST_M, depth_shape, widened
 from hdmap_tools.fusion.cell_counts import CellCounts
-from hdmap_tools.fusion.dense_fusion import FrameView, slots_of
+from hdmap_tools.fusion.dense_fusion import slots_of
+from hdmap_tools.fusion.frame_view import FrameView
 from hdmap_tools.fusion.point_blocks import PointBlock, block_cells
 from hdmap_tools.geometry.camera import PinholeCamera
 from hdmap_tools.geometry.grid import cells_of
@@ -28,10 +29,9 @@ class AllPoints:
         return self.points
 
 
-def project_plainly(local, view, camera: PinholeCamera):
+def project_plainly(local, n, camera: PinholeCamera):
     """Pixel (row, column), whether it is in the image, whether it is far enough; and depth."""
     f = np.float32
-    n = view.numbers
     assert local.dtype == n.dtype == f
     x, y, z = local.T
 
@@ -72,10 +72,11 @@ def fuse_plainly(counts: CellCounts, points: MapPoints, labels, camera, pose, ke
             axis=1
         )
         block = PointBlock.from_points(index, points, meta)
-        view = FrameView.of(camera, pose, config).from_block(block.corner_city)
+        frame = FrameView.of(camera, pose, config)
+        numbers, _ = frame.of_block(block.ground, block.corner_city, meta.resolution_m)
         local_m = points.points_city[inside] - block.corner_city
         local = np.rint(1000.0 * local_m).astype(np.float32)
-        pixel, ok, is_far, depth = project_plainly(local, view, camera)
+        pixel, ok, is_far, depth = project_plainly(local, numbers, camera)
         is_ground = points.is_ground[inside]
         hides = ok & ~is_ground & (depth > NEAREST_M)
         np.minimum.at(buffer, tuple(pixel[hides].T // CELL_PX), depth[hides])
@@ -83,7 +84,7 @@ def fuse_plainly(counts: CellCounts, points: MapPoints, labels, camera, pose, ke
         ground.append((np.flatnonzero(inside)[takes], pixel[takes], depth[takes]))
     at, pixel, depth = (np.concatenate(column) for column in zip(*ground, strict=True))
     found = labels[pixel[:, 0], pixel[:, 1]]
-    seen = slots_of(meta.label_set)[found] > 0
+    seen = slots_of(meta.label_set)[2 * found.astype(np.int64)] > 0
     if config.occlusion_test:
         far = widened(buffer, camera, MAP_GAP_DEG, MAP_GAP_DEG) + np.float32(MARGIN_M)
         seen &= depth <= far[tuple(pixel.T // CELL_PX)]
