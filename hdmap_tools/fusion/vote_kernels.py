@@ -31,6 +31,9 @@ _30: Final = np.uint64(30)
 _27: Final = np.uint64(27)
 _31: Final = np.uint64(31)
 
+_CROWDED: Final = 16
+"""So many points in a cell are worth passing over again and again."""
+
 SLOTS_DIFFER: Final = np.uint16(65535)
 """In place of the slot that all points of a cell have, where they do not."""
 
@@ -89,7 +92,6 @@ def _hash(ix: int, iy: int, channel: int, key: np.uint64) -> np.uint64:
 def scratch_for(num_channels: int) -> tuple[NDArrayAny, ...]:
     """What `vote_cells` writes into while it counts."""
     return (
-        np.zeros((4, num_channels + 1), dtype=np.uint32),
         np.zeros(num_channels, dtype=np.int64),
         np.empty(num_channels, dtype=np.int64),
         np.empty(num_channels, dtype=np.uint64),
@@ -185,11 +187,7 @@ def vote_cells(
     height_sums, square_sums, intensity_sums = sums
     counts, height_n, height_sum, height_sum_sq, intensity_n, intensity_sum = layers
     slots, alike, base = found
-    tally, points, touched, chance, quanta, remainder = scratch
-    tally0, tally1, tally2, tally3 = tally[0], tally[1], tally[2], tally[3]
-    num_channels = len(counts)
-    crowded = max(2 * num_channels, 16)
-    one, zero = np.uint32(1), np.uint32(0)
+    points, touched, chance, quanta, remainder = scratch
     has_sums, all_measured = len(height_sums) > 0, len(has_intensity) == 0
     in_all = np.int64(0)
     for k in range(first_cell, last_cell):
@@ -204,23 +202,22 @@ def vote_cells(
             if same > 0:
                 touched[0], points[same - 1] = np.int64(same) - 1, count
                 num, seen = 1, np.int64(count)
-        elif count >= crowded:
-            # Four tallies side by side: the next count need not wait for the last.
-            for i in range(count // 4):
-                tally0[here[4 * i]] += one
-                tally1[here[4 * i + 1]] += one
-                tally2[here[4 * i + 2]] += one
-                tally3[here[4 * i + 3]] += one
-            for i in range(count - count % 4, count):
-                tally0[here[i]] += one
-            for slot in range(num_channels + 1):
-                total = np.int64(tally0[slot] + tally1[slot] + tally2[slot] + tally3[slot])
-                if total > 0:
-                    tally0[slot] = tally1[slot] = tally2[slot] = tally3[slot] = zero
-                    if slot > 0:
-                        touched[num], points[slot - 1] = slot - 1, total
-                        num += 1
-                        seen += total
+        elif _CROWDED <= count < SLOTS_DIFFER:
+            # One pass for each thing in it, 16 bits wide: faster than a tally, whose next count
+            # must wait for the last.
+            slot = SLOTS_DIFFER
+            for i in range(count):
+                slot = min(slot, here[i])
+            while slot != SLOTS_DIFFER:
+                total, following = np.uint16(0), SLOTS_DIFFER
+                for i in range(count):
+                    total = np.uint16(total + np.uint16(here[i] == slot))
+                    following = min(following, here[i] if here[i] > slot else SLOTS_DIFFER)
+                if slot > 0:
+                    touched[num], points[np.int64(slot) - 1] = np.int64(slot) - 1, np.int64(total)
+                    num += 1
+                    seen += np.int64(total)
+                slot = following
         else:
             for i in range(count):
                 channel = np.int64(here[i]) - 1
@@ -242,6 +239,17 @@ def vote_cells(
                 counts[touched[j], cell] += np.uint32(points[touched[j]])
         elif num == 1:
             counts[touched[0], cell] += np.uint32(SHARE_QUANTA if mode == SHARE else 1)
+        elif mode == SHARE and num == 2:
+            # One quantum at most is left, for the larger remainder; the remainders add up to `seen`.
+            share = np.uint32(SHARE_QUANTA * points[touched[0]])
+            first_share = np.int64(share // np.uint32(seen))
+            twice = 2 * (np.int64(share) - first_share * seen)
+            if twice > seen or (
+                twice == seen and _hash(ix, iy, touched[0], key) < _hash(ix, iy, touched[1], key)
+            ):
+                first_share += 1
+            counts[touched[0], cell] += np.uint32(first_share)
+            counts[touched[1], cell] += np.uint32(SHARE_QUANTA - first_share)
         elif mode == SHARE:
             left = SHARE_QUANTA
             for j in range(num):
