@@ -134,3 +134,29 @@ def test_compiled_votes_are_the_plain_ones_bit_for_bit(
     assert compiled.equals(plain)
     assert compiled.tile_indices() == plain.tile_indices()
     assert compiled.num_frames == plain.num_frames == 2
+
+
+@pytest.mark.parametrize("mode", ["share", "majority", "frame", "point"])
+@pytest.mark.parametrize("num_labels", [2, 3, 5])
+def test_crowded_cells_are_shared_as_plain_numpy_shares_them(mode, num_labels):
+    # 1 to 31 is a tie of remainders, 16 to 16 of points: each in 40 cells, so that luck shows.
+    rng = np.random.default_rng(num_labels)
+    shapes = [(1, 31), (16, 16), (3, 13), (5, 27), (40, 8)]
+    if num_labels > 2:
+        shapes = [tuple(rng.integers(0, 30, num_labels)) for _ in range(40)]
+    cells = [(5 * k + c, k) for k in range(len(shapes)) for c in range(40)]
+    centres = (np.array(cells) + 0.5) * 0.2
+    labels = [
+        rng.permutation(np.repeat(np.arange(num_labels), shape))
+        for shape in shapes
+        for _ in range(40)
+    ]
+    xy = np.repeat(centres, [len(some) for some in labels], axis=0)
+    flat = np.concatenate(labels).astype(np.uint8)
+    seen = Observations(np.column_stack([xy, rng.normal(0, 0.1, len(xy))]), flat, 30 * flat)
+    of_meta = meta(count_mode=mode, label_set=label_set_of(num_labels))
+    fast, plain = CellCounts(of_meta), CellCounts(of_meta)
+    for key in range(3):
+        fast.add(seen, key)
+        add_plainly(plain, seen, key)
+    assert fast.equals(plain)
