@@ -65,27 +65,30 @@ def view_at(
             rows[j, 3] -= rows[j, k] * translation[k]
         for j in range(2, 5):
             rows[j, 3] -= rows[j, k] * at_camera
-    ahead, left, right, down, depth = rows
     reach, across, least_range = clip_m
-    sides = 0 if is_distorted else 4
-    planes = np.empty((5 + sides, 4))
-    inner = np.empty((5 + sides if sides else 0, 4))
-    planes[0], planes[1] = ahead, depth
-    planes[1, 3] -= least_depth_m
-    planes[2], planes[3], planes[4] = -ahead, -left, left
-    planes[2, 3] += reach
-    planes[3, 3] += across
-    planes[4, 3] += across
-    if sides:
-        fx, fy, cx, cy = pinhole
-        inner[:5] = planes[:5]
-        inner[0, 3] -= max(0.0, place[0] + least_range)
-        inner[1, 3] += least_depth_m - _INNER_DEPTH_M
-        for half_spaces, margin in ((planes, _MARGIN_PX + 0.5), (inner, 0.5 - _MARGIN_PX)):
-            half_spaces[5] = fx * right + (cx + margin) * depth
-            half_spaces[6] = fy * down + (cy + margin) * depth
-            half_spaces[7] = (size_px[0] - 1 + margin - cx) * depth - fx * right
-            half_spaces[8] = (size_px[1] - 1 + margin - cy) * depth - fy * down
+    fx, fy, cx, cy = pinhole
+    num = 5 if is_distorted else 9
+    planes, inner = np.empty((num, 4)), np.empty((0 if is_distorted else num, 4))
+    # Loops over numbers: whole rows at once take many times as long to compile.
+    for k in range(4):
+        ahead, left, right, down, depth = rows[0, k], rows[1, k], rows[2, k], rows[3, k], rows[4, k]
+        one = 1.0 if k == 3 else 0.0
+        planes[0, k] = ahead
+        planes[1, k] = depth - least_depth_m * one
+        planes[2, k] = reach * one - ahead
+        planes[3, k] = across * one - left
+        planes[4, k] = across * one + left
+        if is_distorted:
+            continue
+        inner[0, k] = ahead - max(0.0, place[0] + least_range) * one
+        inner[1, k] = depth - _INNER_DEPTH_M * one
+        for p in range(2, 5):
+            inner[p, k] = planes[p, k]
+        for half_spaces, margin in ((planes, 0.5 + _MARGIN_PX), (inner, 0.5 - _MARGIN_PX)):
+            half_spaces[5, k] = fx * right + (cx + margin) * depth
+            half_spaces[6, k] = fy * down + (cy + margin) * depth
+            half_spaces[7, k] = (size_px[0] - 1 + margin - cx) * depth - fx * right
+            half_spaces[8, k] = (size_px[1] - 1 + margin - cy) * depth - fy * down
     return rows, planes, inner
 
 
@@ -139,7 +142,8 @@ def _rows_in_view(
             last -= 1
         low, high = -np.inf, (np.inf if len(inner_planes) else -np.inf)
         for p in range(len(inner_planes)):
-            a, b, c, d = inner_planes[p]
+            a, b = inner_planes[p, 0], inner_planes[p, 1]
+            c, d = inner_planes[p, 2], inner_planes[p, 3]
             rest = min(b * y0, b * y1) + min(c * z_range[0], c * z_range[1]) + d - _SLACK
             if a > 1e-9:
                 low = max(low, -rest / a)

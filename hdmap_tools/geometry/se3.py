@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -228,6 +229,15 @@ class Trajectory:
         rotations, translations = self.interpolate_many(np.array([timestamp_ns]))
         return SE3(rotations[0], translations[0])
 
+    @cached_property
+    def _knots_s(self) -> NDArrayFloat:
+        # Relative seconds: nanoseconds since 1970 do not fit a float64.
+        return np.asarray((self.timestamps_ns - self.timestamps_ns[0]) / 1e9)
+
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self._knots_s, Rotation.from_matrix(self.rotations))
+
     def interpolate_many(self, timestamps_ns: NDArrayInt) -> tuple[NDArrayFloat, NDArrayFloat]:
         """Rotations (M, 3, 3) and translations (M, 3) at many times.
 
@@ -246,12 +256,10 @@ class Trajectory:
             first = min(first, len(self) - 2)
             last = max(int(np.searchsorted(self.timestamps_ns, times.max())), first + 1)
         near = slice(first, last + 1)
-        # Relative seconds: nanoseconds since 1970 do not fit a float64.
-        origin = self.timestamps_ns[0]
-        knots, query = (self.timestamps_ns[near] - origin) / 1e9, (times - origin) / 1e9
-        rotations = Slerp(knots, Rotation.from_matrix(self.rotations[near]))(query).as_matrix()
+        query = (times - self.timestamps_ns[0]) / 1e9
+        rotations = self._slerp(query).as_matrix()
         translations = np.column_stack(
-            [np.interp(query, knots, self.translations[near, k]) for k in range(3)]
+            [np.interp(query, self._knots_s[near], self.translations[near, k]) for k in range(3)]
         )
         exact = np.searchsorted(self.timestamps_ns, times)
         hit = self.timestamps_ns[exact] == times
