@@ -1,0 +1,77 @@
+"""An S3 server on the loopback address, for tests."""
+
+import http.client
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import pytest
+
+CREDENTIALS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret"}
+"""The server takes any."""
+
+
+@dataclass(frozen=True)
+class S3Server:
+    """A running server with one bucket, ``maps``."""
+
+    host: str
+    port: int
+
+    @property
+    def url(self) -> str:
+        return f"http://{self.host}:{self.port}"
+
+    def keys(self, prefix: str) -> list[str]:
+        """Names of the objects below a prefix."""
+        listing = self.request("GET", f"/maps?list-type=2&prefix={prefix}/")
+        return [key.removeprefix(f"{prefix}/") for key in re.findall("<Key>(.*?)</Key>", listing)]
+
+    def request(self, method: str, path: str, body: bytes | None = None) -> str:
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=10)
+        try:
+            connection.request(method, path, body)
+            answer = connection.getresponse()
+            text = answer.read().decode()
+            assert answer.status in (200, 204), text
+            return text
+        finally:
+            connection.close()
+
+    @contextmanager
+    def asking_for_rights(self) -> Iterator[None]:
+        """From now on credentials are looked up, and nobody has any."""
+        self.request("POST", "/moto-api/reset-auth", b"0")
+        try:
+            yield
+        finally:
+            self.request("POST", "/moto-api/reset-auth", b"inf")
+
+
+@contextmanager
+def s3_server() -> Iterator[S3Server]:
+    """A server that ends with the block."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer("127.0.0.1", 0, verbose=False)
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server.start()
+    try:
+        running = S3Server(*server.get_host_and_port())
+        running.request("PUT", "/maps")
+        yield running
+    finally:
+        server.stop()
+
+
+def use(server: S3Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the environment name the server, and nothing else."""
+    for name in ("AWS_PROFILE", "AWS_ENDPOINT_URL_S3", "AWS_SESSION_TOKEN", "AWS_DEFAULT_REGION"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_CONFIG_FILE", "/nonexistent")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", "/nonexistent")
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", server.url)
+    monkeypatch.setenv("AWS_REGION", "eu-central-1")
+    for name, value in CREDENTIALS.items():
+        monkeypatch.setenv(name, value)
