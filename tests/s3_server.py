@@ -12,6 +12,12 @@ import pytest
 CREDENTIALS = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "secret"}
 """The server takes any."""
 
+_SIGNED = {
+    "Authorization": "AWS4-HMAC-SHA256 Credential=key/20260101/us-east-1/s3/aws4_request, "
+    "SignedHeaders=host, Signature=none"
+}
+"""Without it the server takes a request for a stranger's; it does not check the signature."""
+
 
 @dataclass(frozen=True)
 class S3Server:
@@ -32,7 +38,7 @@ class S3Server:
     def request(self, method: str, path: str, body: bytes | None = None) -> str:
         connection = http.client.HTTPConnection(self.host, self.port, timeout=10)
         try:
-            connection.request(method, path, body)
+            connection.request(method, path, body, _SIGNED)
             answer = connection.getresponse()
             text = answer.read().decode()
             assert answer.status in (200, 204), text

@@ -127,7 +127,6 @@ def test_unfinished_work_is_not_mixed_with_another_build(
     fails(*coarse, says=("configuration", "--no-resume"))
     assert hdmap(*coarse, "--no-resume")[0] == 0
     assert opened(address).meta.resolution_m == 0.5
-    assert [m for m, _ in told(opened(address))][0] == "Empty map"
     assert len(told(opened(address))) == 4
     assert branches_of(s3, address) == {"main"}
 
@@ -190,11 +189,11 @@ def test_workers_write_to_s3(s3, address, hdmap, whole):
 def test_every_command_that_reads_maps_reads_them_in_s3(s3, address, street, hdmap, whole):
     assert hdmap(*BUILD, "-o", address)[0] == 0
 
-    def alike(*command, **more):
+    def alike(*command):
         """What a command says of both maps, but for their names and the times of commits."""
         told = []
-        for place, name in (("whole", "here"), (address, "there")):
-            code, out, err = hdmap(*[c.format(map=place, name=name) for c in command], **more)
+        for place, name in (("whole", "one_made"), (address, "other_made")):
+            code, out, err = hdmap(*[c.format(map=place, name=name) for c in command])
             assert code == 0, err
             told.append(out.replace(place, "MAP").replace(name, "NAME"))
         return told
@@ -208,8 +207,8 @@ def test_every_command_that_reads_maps_reads_them_in_s3(s3, address, street, hdm
     assert hdmap("vectorize", *mask)[0] == 0
     here, there = alike("compare", "{map}", "marks.gpkg", "--json", "{name}.json")
     assert here == there
-    assert json.loads((street / "here.json").read_text()) == json.loads(
-        (street / "there.json").read_text()
+    assert json.loads((street / "one_made.json").read_text()) == json.loads(
+        (street / "other_made.json").read_text()
     )
     here, there = alike("reliability", "{map}", "--truth", "marks.gpkg", "-o", "{name}")
     assert here == there
