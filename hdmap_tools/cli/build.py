@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     "--scheduler",
     metavar="ADDRESS",
     help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find drive, "
-    "network, point map and OUT under the same paths.",
+    "network, point map and OUT under the same paths; OUT in S3 with the same environment.",
 )
 @click.option("--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB.")
 @options.overwrite_option

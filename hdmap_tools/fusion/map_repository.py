@@ -12,13 +12,16 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
 from hdmap_tools.errors import OutputExistsError, StoreError
 from hdmap_tools.fusion.map_location import MAIN, MapLocation, S3Location
 from hdmap_tools.fusion.map_store import is_semantic_map, quiet_icechunk, root_cause, store_errors
+from hdmap_tools.fusion.s3_errors import why_not_asked
 
 if TYPE_CHECKING:
     import icechunk
@@ -26,19 +29,12 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 _ANSWERS_WITHIN_S: Final = 20.0
-"""For the first request; Icechunk's ten tries at a closed port take about 5 s."""
+"""For the first request; Icechunk's ten tries would take up to a minute."""
+
+_CONNECTS_WITHIN_S: Final = 5.0
 
 _CLOCKS_DIFFER_BY: Final = timedelta(minutes=15)
 """At most: S3 refuses requests that are further off (its error RequestTimeTooSkewed)."""
-
-_REFUSALS: Final = (
-    "AccessDenied",
-    "Forbidden",
-    "InvalidAccessKeyId",
-    "SignatureDoesNotMatch",
-    "ExpiredToken",
-    "InvalidToken",
-)
 
 
 def is_map_there(location: MapLocation) -> bool:
@@ -213,6 +209,23 @@ def _endpoint() -> str | None:
     return os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or None
 
 
+def _require_listening(endpoint: str, location: S3Location) -> None:
+    """Try a connection, once: an address with nothing behind it is most often mistyped.
+
+    Raises:
+        StoreError: If there is none.
+    """
+    try:
+        url = urlsplit(endpoint)
+        port = url.port or (443 if url.scheme == "https" else 80)
+        socket.create_connection((url.hostname or "", port), _CONNECTS_WITHIN_S).close()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise StoreError(
+            f"Nothing answers for {location} at {endpoint} ({reason}); check AWS_ENDPOINT_URL and the network."
+        ) from error
+
+
 def _is_repository(location: S3Location) -> bool:
     """Whether there is a repository; asked first, so that what is wrong with S3 is said here.
 
@@ -222,38 +235,18 @@ def _is_repository(location: S3Location) -> bool:
     from zarr.core.sync import sync
 
     icechunk = quiet_icechunk()
-    storage = _storage(location)
+    storage, endpoint = _storage(location), _endpoint()
+    server = endpoint or "AWS"
+    if endpoint is not None:
+        _require_listening(endpoint, location)
     try:
         return bool(sync(icechunk.Repository.exists_async(storage), timeout=_ANSWERS_WITHIN_S))
     except TimeoutError as error:
         raise StoreError(
-            f"{_server()} did not answer within {_ANSWERS_WITHIN_S:g} s, asked for {location}; check "
+            f"{server} did not answer within {_ANSWERS_WITHIN_S:g} s, asked for {location}; check "
             "AWS_ENDPOINT_URL, AWS_REGION and the network."
         ) from error
     except icechunk.IcechunkError as error:
-        raise StoreError(_what_is_wrong(location, str(error), root_cause(error))) from error
-
-
-def _server() -> str:
-    return _endpoint() or "AWS"
-
-
-def _what_is_wrong(location: S3Location, text: str, cause: str) -> str:
-    if "NoSuchBucket" in text:
-        return f"There is no bucket {location.bucket!r} at {_server()}; make it, or correct {location}."
-    if "credential" in text.lower():
-        return (
-            f"No credentials for {location} were found; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, "
-            "or AWS_PROFILE."
-        )
-    if refused := [code for code in _REFUSALS if code in text]:
-        return (
-            f"{_server()} refuses access to {location} ({refused[0]}); check the credentials and what they "
-            "may do: list the bucket, get, put and delete objects."
-        )
-    if "dispatch failure" in text or "timeout" in text.lower():
-        return (
-            f"Nothing answers for {location} at {_server()} ({cause}); check AWS_ENDPOINT_URL, AWS_REGION "
-            "and the network."
-        )
-    return f"{_server()} cannot be asked for {location}: {cause}."
+        cause = root_cause(error)
+        why = why_not_asked(str(error), cause, str(location), location.bucket, server)
+        raise StoreError(why or f"{server} cannot be asked for {location}: {cause}.") from error

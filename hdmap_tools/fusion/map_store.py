@@ -26,6 +26,7 @@ from hdmap_tools.fusion.cell_counts import (
     combine_tiles,
 )
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.s3_errors import is_outage
 from hdmap_tools.types import NDArrayAny
 
 if TYPE_CHECKING:
@@ -130,13 +131,19 @@ def read_tile(group: zarr.Group, index: TileIndex) -> Tile:
 
 
 def read_layer(group: zarr.Group, name: str, index: TileIndex) -> NDArrayAny | None:
-    """One layer of a tile; None if its chunk is damaged."""
+    """One layer of a tile; None if its chunk is damaged or gone.
+
+    Raises:
+        StoreError: If it cannot be told, as its storage cannot be reached.
+    """
     rows, cols = _region(index)
     try:
-        with store_errors("damaged"):
+        with store_errors(f"Layer {name} of tile {index} cannot be read"):
             array: Any = group[name]
             return np.asarray(array[..., rows, cols])
-    except StoreError:
+    except StoreError as error:
+        if is_outage(str(error.__cause__)):
+            raise
         return None
 
 

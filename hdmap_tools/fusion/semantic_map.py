@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
@@ -464,7 +465,8 @@ class SemanticMap:
             f"The map at {self.location} is damaged or cannot be read; build it anew or take a copy"
         )
         if tile is not None:
-            failed = f"Tile {tile} of the map at {self.location} is damaged; `hdmap build --repair` counts it again"
+            state = "is damaged" if isinstance(self.location, Path) else "cannot be read"
+            failed = f"Tile {tile} of the map at {self.location} {state}; `hdmap build --repair` counts damaged ones again"
         with store_errors(failed):
             yield
 
