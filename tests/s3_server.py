@@ -3,9 +3,10 @@
 import http.client
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
@@ -54,6 +55,33 @@ class S3Server:
             yield
         finally:
             self.request("POST", "/moto-api/reset-auth", b"inf")
+
+
+def watch_writes_of_refs(
+    monkeypatch: pytest.MonkeyPatch, told: Callable[[int], bool | None]
+) -> None:
+    """Be told each write or removal of a branch, numbered from 1, before it is done.
+
+    Args:
+        monkeypatch: Ends the watch.
+        told: Gives True for a request that is to be lost.
+    """
+    from moto.moto_server.werkzeug_app import DomainDispatcherApplication
+
+    original, number = DomainDispatcherApplication.__call__, 0
+
+    def watching(self: Any, environ: dict[str, Any], start_response: Any) -> Any:
+        nonlocal number
+        method, path = environ["REQUEST_METHOD"], environ["PATH_INFO"]
+        is_removal = method == "POST" and environ["QUERY_STRING"].startswith("delete")
+        if is_removal or (method == "PUT" and "/refs/" in path):
+            number += 1
+            if told(number):
+                start_response("500 Lost", [("Content-Length", "0")])
+                return []
+        return original(self, environ, start_response)
+
+    monkeypatch.setattr(DomainDispatcherApplication, "__call__", watching)
 
 
 @contextmanager

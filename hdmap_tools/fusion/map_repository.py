@@ -93,7 +93,7 @@ def make_repository(location: MapLocation) -> icechunk.Repository:
                 raise
             raise OutputExistsError(
                 f"Something that is not a map lies under {location}, so it is left alone; choose another "
-                "prefix, or remove it."
+                "prefix, or remove it (a build that was killed in its first moment leaves `snapshots`)."
             ) from error
     if tip_of(repository, location.branch) is not None:
         raise OutputExistsError(f"{location} exists already; choose another name.")

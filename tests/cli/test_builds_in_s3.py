@@ -8,6 +8,7 @@ import pytest
 
 from hdmap_tools.fusion.map_location import map_location
 from hdmap_tools.fusion.semantic_map import SemanticMap
+from tests.s3_server import watch_writes_of_refs
 
 from .conftest import LABELS
 from .test_resumed_builds import KILLED, told
@@ -70,6 +71,7 @@ def test_something_else_is_left_alone(s3, address, street, fails):
     assert s3.request("GET", f"/{key}") == "mine"
 
 
+@pytest.mark.slow
 def test_readers_see_the_earlier_map_until_the_new_one_is_whole(
     s3, address, hdmap, fails, monkeypatch
 ):
@@ -131,6 +133,7 @@ def test_unfinished_work_is_not_mixed_with_another_build(
     assert branches_of(s3, address) == {"main"}
 
 
+@pytest.mark.slow
 def test_two_builds_of_one_map_at_once(s3, address, street, hdmap, fails, whole, monkeypatch):
     """The second goes on where the first is; the first sees it at its next commit, and stops."""
     original, done = SemanticMap.add, []
@@ -175,6 +178,47 @@ def test_a_build_killed_at_any_point_goes_on(s3, address, street, hdmap, whole, 
     assert opened(address).read().equals(whole.read())
     assert [m for m, _ in told(opened(address))] == [m for m, _ in told(whole)]
     assert branches_of(s3, address) == {"main"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "is_lost"),
+    [(1, True), (2, True), (2, False), (3, True), (5, True), (6, False), (7, True), (7, False)],
+)
+def test_a_build_killed_at_a_write_of_a_branch(
+    s3, address, street, hdmap, fails, whole, monkeypatch, number, is_lost
+):
+    """These decide what is there: 1 repository, 2 branch, 3 empty map, 4 to 6 segments, 7 publishing."""
+    killed = []
+
+    def told(writes):
+        if writes == number and not killed:
+            killed.append(True)
+            build.kill()
+            build.wait()
+            return is_lost
+        return False
+
+    program = "from hdmap_tools.cli.main import main; main()"
+    with monkeypatch.context() as patched:
+        watch_writes_of_refs(patched, told)
+        build = subprocess.Popen(
+            [sys.executable, "-c", program, *BUILD, "-o", address], stderr=subprocess.PIPE
+        )
+        _, err = build.communicate()
+    assert killed, err.decode()
+    if (number, is_lost) == (1, True):
+        # The one moment that is not gone on from: Icechunk's own making of a repository.
+        fails(*BUILD, "-o", address, says=("not a map", "first moment"))
+        return
+    if (number, is_lost) == (7, False):  # published already
+        fails(*BUILD, "-o", address, says=("--overwrite",))
+    else:
+        fails("info", address, says=("not finished",))
+        assert hdmap(*BUILD, "-o", address)[0] == 0
+        assert branches_of(s3, address) == {"main"}
+    assert opened(address).read().equals(whole.read())
+    assert len(opened(address).history()) == len(whole.history())
 
 
 @pytest.mark.slow
@@ -231,6 +275,7 @@ def test_maps_are_merged_from_and_into_s3(s3, address, hdmap, fails, whole):
     assert branches_of(s3, twice) == {"main"}
 
 
+@pytest.mark.slow
 def test_a_merge_leaves_an_unfinished_build_alone(s3, address, street, hdmap, fails, monkeypatch):
     assert hdmap(*BUILD, "-o", "whole")[0] == 0
     stopped_build(address, fails, monkeypatch)
@@ -240,6 +285,7 @@ def test_a_merge_leaves_an_unfinished_build_alone(s3, address, street, hdmap, fa
     assert opened(address).read().equals(SemanticMap.open(street / "whole").read())
 
 
+@pytest.mark.slow
 def test_history_is_changed_in_s3(s3, address, hdmap, whole):
     assert hdmap(*BUILD, "-o", address)[0] == 0
     (drive,) = whole.drives
