@@ -301,11 +301,18 @@ def test_history_is_changed_in_s3(s3, address, hdmap, whole):
 
 
 def test_a_damaged_tile_in_s3_is_counted_again(s3, address, hdmap, whole):
-    assert hdmap(*BUILD, "-o", address)[0] == 0
+    in_one_commit = (
+        "build",
+        "drive",
+        *LABELS,
+        "-o",
+        address,
+    )  # all chunks are of the newest version
+    assert hdmap(*in_one_commit)[0] == 0
     prefix = address.removeprefix("s3://maps/")
     chunk = max(key for key in s3.keys(prefix) if key.startswith("chunks/"))
     s3.request("DELETE", f"/maps/{prefix}/{chunk}")
-    code, out, err = hdmap(*BUILD, "-o", address, "--repair")
+    code, out, err = hdmap(*in_one_commit, "--repair")
     assert code == 0, err
     assert " damaged, counted again from" in out
     assert opened(address).read().equals(whole.read())
