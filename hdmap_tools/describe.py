@@ -13,6 +13,7 @@ from hdmap_tools.compare.reference import is_truth_raster
 from hdmap_tools.errors import FormatError
 from hdmap_tools.formats.by_name import is_readable, read_vector_map
 from hdmap_tools.fusion.cell_counts import TILE_CELLS
+from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.map_store import is_semantic_map
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.point_map.point_files import is_point_file, read_point_file
@@ -22,15 +23,17 @@ from hdmap_tools.simulate.truth_files import SIMULATION_NAME, TRUTH_FOLDER
 
 
 def describe(
-    path: Path, layout: str = "auto", scene: str | None = None, cameras: Sequence[str] = ()
+    path: MapLocation, layout: str = "auto", scene: str | None = None, cameras: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Facts about a drive, a semantic map (or the folder of a run), a point map, or a file.
 
-    Files are vector maps, masks, and point clouds.
+    What lies in S3 is a semantic map. Files are vector maps, masks, and point clouds.
 
     Raises:
         HDMapError: If it is none of these, or cannot be read.
     """
+    if not isinstance(path, Path):
+        return _describe_semantic_map(path)
     if not path.exists():
         raise FormatError(
             f"{path} does not exist; expected a drive, a semantic map, a point map, a vector map or a mask."
@@ -148,7 +151,7 @@ def _describe_point_cloud(path: Path) -> dict[str, Any]:
     }
 
 
-def _describe_semantic_map(path: Path) -> dict[str, Any]:
+def _describe_semantic_map(path: MapLocation) -> dict[str, Any]:
     semantic_map = SemanticMap.open(path)
     meta, tiles = semantic_map.meta, semantic_map.tile_indices()
     tile_m2 = (TILE_CELLS * meta.resolution_m) ** 2

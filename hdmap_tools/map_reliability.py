@@ -18,6 +18,7 @@ from hdmap_tools.compare.reliability import (
 )
 from hdmap_tools.config import Config
 from hdmap_tools.errors import ConfigError, FormatError
+from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.observation_model import OTHER
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.fusion.temperature import BLOCK_M, checkerboard, read_evidence
@@ -34,7 +35,7 @@ INTENSITY_NAME: Final = "intensity.json"
 
 
 def reliability_alone(
-    map_path: Path,
+    map_path: MapLocation,
     truth_path: Path,
     out: Path,
     config: Config,

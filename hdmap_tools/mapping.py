@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from hdmap_tools.errors import ConfigError, DriveError
 from hdmap_tools.frame_source import FrameCounts, FrameSource, LabelledImages
 from hdmap_tools.fusion.cell_counts import CellCounts
 from hdmap_tools.fusion.intensity import otsu_threshold
+from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.map_repository import is_map_there
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.fusion.tiles_on_disk import TilesOnDisk
 from hdmap_tools.labels.label_set import DRIVABLE_CLASSES, LabelSet
@@ -61,7 +64,7 @@ def fuse(
     meta: MapMeta,
     commits: Mapping[str, Callable[[CellCounts], object]],
     counts: FrameCounts,
-    folder: Path,
+    folder: Path | None,
     memory: MemoryBudget | None = None,
 ) -> None:
     """Associate and count the labelled images of a segment, by each method on its own.
@@ -72,7 +75,7 @@ def fuse(
         meta: What the counts mean.
         commits: By method, what takes the counts of a segment.
         counts: Told how many images were used, and what they saw.
-        folder: For tiles that memory has no room for.
+        folder: For tiles that memory has no room for; None: where the system keeps such.
         memory: What may be kept in memory; None: all.
     """
     with ExitStack() as stack:
@@ -171,7 +174,7 @@ def intensity_threshold(
 def build_map(
     drive: Drive,
     segmenter: Segmenter,
-    path: Path,
+    location: MapLocation,
     config: Config,
     cache: LabelCache | None,
     steps: Steps,
@@ -179,6 +182,8 @@ def build_map(
     resume: bool = False,
     elsewhere: Elsewhere | None = None,
     memory: MemoryBudget | None = None,
+    scratch: Path | None = None,
+    note: dict[str, Any] | None = None,
 ) -> tuple[dict[str, SemanticMap], FrameCounts]:
     """Segment, associate and fuse a drive into new semantic maps, one for each method.
 
@@ -188,17 +193,19 @@ def build_map(
     Args:
         drive: Where images, sweeps and poses come from.
         segmenter: Labels its images.
-        path: The map of the configured method.
+        location: Of the map of the configured method.
         config: Association, fusion and limits in time.
         cache: Where label images are kept between runs.
         steps: Told of progress.
         also_in: Folder for the maps of the methods in `association.also`, by name;
             None leaves them out.
-        resume: Go on with the map at `path`, if there is one: made from the same drive,
+        resume: Go on with the map at `location`, if there is one: made from the same drive,
             network and configuration.
         elsewhere: Counts the segments of the configured method in other processes; None:
             they are counted here.
         memory: What may be kept in memory; None: a segment's tiles, and 64 MiB of points.
+        scratch: Folder for what is put aside; None: where the system keeps such.
+        note: Metadata of the first version of the configured method's map.
 
     Returns:
         Maps by method, the configured one first; and what went in.
@@ -237,15 +244,17 @@ def build_map(
 
     with steps.timed("segment and fuse"):
         maps: dict[str, SemanticMap] = {}
-        if resume and path.exists():
-            maps = {source.methods[0]: SemanticMap.open(path)}
+        if resume and is_map_there(location):
+            maps = {source.methods[0]: SemanticMap.open(location)}
             meta = maps[source.methods[0]].meta
         else:
             threshold = intensity_threshold(config, source, images, labels_of, segmenter.label_set)
             meta = map_meta(config, drive, segmenter, threshold)
             for number, method in enumerate(source.methods):
-                made = path if number == 0 or also_in is None else also_in / method
-                maps[method] = SemanticMap.create(made, meta)
+                if number == 0 or also_in is None:
+                    maps[method] = SemanticMap.create(location, meta, note)
+                else:
+                    maps[method] = SemanticMap.create(also_in / method, meta)
         done = maps[source.methods[0]].segments_of(drive.id)
         if done:
             _LOG.info("Going on after %d segments that are in the map already.", len(done))
@@ -259,7 +268,7 @@ def build_map(
             some = images[number * size : (number + 1) * size]
             commits = {m: partial(_commit, made, drive.id, number) for m, made in maps.items()}
             labelled = labels_again(some, number * size)
-            fuse(source, labelled, meta, commits, counts, path.parent, memory)
+            fuse(source, labelled, meta, commits, counts, scratch, memory)
     silent = sorted({i.camera for i in images} - {c for c, n in counts.observations.items() if n})
     if not maps[source.methods[0]].tile_indices():
         raise DriveError(

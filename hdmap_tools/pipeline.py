@@ -102,6 +102,7 @@ def run(
             cache,
             steps,
             also_in=folder.parent / "also",
+            scratch=folder,
         )
         with steps.timed("read"):
             made = maps[config.association.method]

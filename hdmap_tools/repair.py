@@ -13,6 +13,7 @@ from hdmap_tools.config import AssociationConfig, Config
 from hdmap_tools.errors import MapMismatchError
 from hdmap_tools.frame_source import FrameCounts, FrameSource
 from hdmap_tools.fusion.cell_counts import TILE_CELLS, CellCounts, Tile, TileIndex
+from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import Drives, SemanticMap
 from hdmap_tools.mapping import count_images, map_meta
@@ -32,7 +33,7 @@ _BESIDE_M: Final = 10.0
 
 def repair_map(
     drive_path: Path,
-    path: Path,
+    location: MapLocation,
     config: Config,
     *,
     cache: LabelCache | None = None,
@@ -42,7 +43,7 @@ def repair_map(
 
     Args:
         drive_path: The drive that the map was built from.
-        path: The map.
+        location: The map.
         config: As it was built with; resolution and such are taken from the map.
         cache: Where label images are kept.
         steps: Told of progress.
@@ -56,7 +57,7 @@ def repair_map(
             this drive gives with these settings; then nothing is changed.
     """
     steps = steps or Steps()
-    semantic_map = SemanticMap.open(path)
+    semantic_map = SemanticMap.open(location)
     meta, drives = semantic_map.meta, semantic_map.drives
     with steps.timed("check"):
         damaged = semantic_map.damaged_tiles()
@@ -75,7 +76,8 @@ def repair_map(
         _require_only(drive.id, drives)
         segmenter = open_segmenter(config.segmentation, drive)
         map_meta(config, drive, segmenter, meta.intensity_threshold).require_compatible(meta)
-    with TemporaryDirectory(prefix=".repair.", dir=path.absolute().parent) as scratch:
+    beside = location.absolute().parent if isinstance(location, Path) else None
+    with TemporaryDirectory(prefix=".repair.", dir=beside) as scratch:
         with steps.timed("points"):
             config, drive = with_points(config, drive, Path(scratch))
         with steps.timed("segment and fuse"):

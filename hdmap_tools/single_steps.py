@@ -19,21 +19,20 @@ from hdmap_tools.distributed.count_segment import SegmentTask
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.frame_source import FrameCounts
+from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.map_meta import MapMeta
-from hdmap_tools.fusion.map_store import is_semantic_map
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.mapping import build_map, map_meta
 from hdmap_tools.memory_budget import MemoryBudget
 from hdmap_tools.opening import open_configured, open_for
-from hdmap_tools.output_folder import map_folder, require_free
 from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import Drive
 from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
-from hdmap_tools.unfinished import resumable_folder
+from hdmap_tools.unfinished_map import map_when_done, require_free_for_map, resumable_map
 from hdmap_tools.vectorization import VectorizationResult, choose, vectorize
 from hdmap_tools.view.agreement import agreement_picture
 
@@ -42,10 +41,10 @@ _LOG = logging.getLogger(__name__)
 
 def build_alone(
     drive_path: Path,
-    out: Path,
+    out: MapLocation,
     config: Config,
     *,
-    like: Path | None = None,
+    like: MapLocation | None = None,
     cache: LabelCache | None = None,
     overwrite: bool = False,
     resume: bool = True,
@@ -74,7 +73,7 @@ def build_alone(
         Drive, images used and dropped, tiles, seconds by step.
     """
     steps = steps or Steps()
-    require_free(out, overwrite, is_semantic_map)
+    require_free_for_map(out, overwrite)
     with steps.timed("open"):
         drive = open_for(config, drive_path)
         segmenter = open_segmenter(config.segmentation, drive)
@@ -86,11 +85,9 @@ def build_alone(
     if memory is not None:
         memory.tiles_bytes(map_meta(config, drive, segmenter, 1))  # says so if it is too little
     plan = _plan(drive, segmenter, config)
-    with resumable_folder(
-        out, plan, overwrite=overwrite, is_ours=is_semantic_map, resume=resume
-    ) as work:
+    with resumable_map(out, plan, overwrite=overwrite, resume=resume) as work:
         with steps.timed("points"):
-            config, drive = with_points(config, drive, work / "scratch")
+            config, drive = with_points(config, drive, work.scratch / "scratch")
         with ExitStack() as stack:
             elsewhere = None
             if workers is not None:
@@ -99,13 +96,15 @@ def build_alone(
             maps, counts = build_map(
                 drive,
                 segmenter,
-                work / out.name,
+                work.location,
                 config,
                 cache,
                 steps,
                 resume=True,
                 elsewhere=elsewhere,
                 memory=memory,
+                scratch=work.scratch,
+                note=work.note,
             )
         made = maps[config.association.method]
         report = {
@@ -165,7 +164,7 @@ def settings_of(config: Config, meta: MapMeta) -> Config:
 
 
 def vectorize_alone(
-    map_path: Path, out: Path, config: Config, *, overwrite: bool = False
+    map_path: MapLocation, out: Path, config: Config, *, overwrite: bool = False
 ) -> VectorizationResult:
     """Vectorize a semantic map into a GeoPackage."""
     if out.exists() and not overwrite:
@@ -179,7 +178,7 @@ def vectorize_alone(
 
 
 def compare_alone(
-    map_path: Path,
+    map_path: MapLocation,
     reference_path: Path,
     config: Config,
     *,
@@ -217,9 +216,9 @@ def compare_alone(
 
 
 def merge_maps(
-    maps: Sequence[Path],
-    subtract: Sequence[Path],
-    out: Path,
+    maps: Sequence[MapLocation],
+    subtract: Sequence[MapLocation],
+    out: MapLocation,
     *,
     allow_repeats: bool = False,
     overwrite: bool = False,
@@ -230,8 +229,8 @@ def merge_maps(
     """
     opened = [SemanticMap.open(path) for path in maps]
     taken = [SemanticMap.open(path) for path in subtract]
-    with map_folder(out, overwrite) as folder:
-        merged = SemanticMap.create(folder, opened[0].meta)
+    with map_when_done(out, overwrite) as place:
+        merged = SemanticMap.create(place, opened[0].meta)
         for path, one in zip(maps, opened, strict=True):
             merged.merge(one, str(path), allow_repeats=allow_repeats)
         for path, one in zip(subtract, taken, strict=True):

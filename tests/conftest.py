@@ -1,10 +1,15 @@
 """Fixtures shared by all tests."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from tests.s3_server import S3Server
 
 # A deadline for each example measures how busy the machine is, not our code.
 settings.register_profile("hdmap", deadline=None)
@@ -38,3 +43,21 @@ def simulated_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     out = tmp_path_factory.mktemp("simulated") / "drive"
     return simulate_drive(shipped_world(), out, settings)
+
+
+@pytest.fixture(scope="session")
+def s3_running() -> "Iterator[S3Server]":
+    """An S3 server on the loopback address, with a bucket ``maps``."""
+    from tests.s3_server import s3_server
+
+    with s3_server() as server:
+        yield server
+
+
+@pytest.fixture
+def s3(s3_running: "S3Server", monkeypatch: pytest.MonkeyPatch) -> "S3Server":
+    """The server, which the environment names; its bucket may hold what other tests put there."""
+    from tests.s3_server import use
+
+    use(s3_running, monkeypatch)
+    return s3_running

@@ -17,11 +17,17 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("drive", type=options.PATH)
-@click.option("-o", "--out", type=options.PATH, required=True, help="Semantic map to make.")
+@click.option(
+    "-o",
+    "--out",
+    type=options.MAP,
+    required=True,
+    help="Semantic map to make: a folder, or s3://BUCKET/PREFIX.",
+)
 @options.drive_options
 @options.segmentation_options
 @click.option(
-    "--like", type=options.PATH, help="Take this map's settings over, so that both can be merged."
+    "--like", type=options.MAP, help="Take this map's settings over, so that both can be merged."
 )
 @options.association_option
 @options.resolution_option
@@ -51,7 +57,7 @@ if TYPE_CHECKING:
     "--scheduler",
     metavar="ADDRESS",
     help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find drive, "
-    "network, point map and OUT under the same paths.",
+    "network, point map and OUT under the same paths; OUT in S3 with the same environment.",
 )
 @click.option("--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB.")
 @options.overwrite_option
@@ -66,6 +72,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
       hdmap build path/to/drive -o map --model road-segmentation-adas-0001.xml
       hdmap build path/to/next_drive -o map2 --like map
       hdmap build path/to/drive -o map --workers 8
+      hdmap build path/to/drive -o s3://bucket/maps/monday
 
     A build that was killed goes on after its last commit when the same command is given
     again, and ends with the same map. The map is a versioned repository of counts; read it with `hdmap vectorize`,

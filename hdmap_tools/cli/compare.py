@@ -10,7 +10,7 @@ from hdmap_tools.cli import options
 
 
 @click.command()
-@click.argument("candidate", type=options.PATH)
+@click.argument("candidate", type=options.MAP)
 @click.argument("reference", type=options.PATH)
 @click.option("--picture", type=options.PATH, help="PNG of agreement, misses and false alarms.")
 @click.option(

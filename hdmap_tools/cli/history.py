@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from hdmap_tools.cli import options
 
+if TYPE_CHECKING:
+    from hdmap_tools.fusion.map_location import MapLocation
+
 
 @click.command()
-@click.argument("semantic_map", type=options.PATH)
+@click.argument("semantic_map", type=options.MAP)
 @click.option("--diff", nargs=2, metavar="BEFORE AFTER", help="Say what differs of two versions.")
 @click.option("--roll-back", metavar="VERSION", help="Make a new version that equals this one.")
 @click.option("--take-out", metavar="DRIVE", help="Subtract what a drive added, in a new version.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def command(
-    semantic_map: Path,
+    semantic_map: MapLocation,
     diff: tuple[str, str] | None,
     roll_back: str | None,
     take_out: str | None,

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from hdmap_tools.cli import options
 
+if TYPE_CHECKING:
+    from hdmap_tools.fusion.map_location import MapLocation
+
 
 @click.command()
-@click.argument("path", type=options.PATH, required=False)
+@click.argument("path", type=options.MAP, required=False)
 @options.drive_options
 @click.option("--default-config", is_flag=True, help="Print hdmap.yaml with all defaults instead.")
 @options.overwrite_option
 @options.json_option
-def command(path: Path | None, **given: Any) -> None:
+def command(path: MapLocation | None, **given: Any) -> None:
     """Say what a drive, a semantic map, a point map or a vector file holds.
 
     \b
@@ -25,7 +27,7 @@ def command(path: Path | None, **given: Any) -> None:
       hdmap info path/to/drive
       hdmap info --default-config > hdmap.yaml
 
-    PATH is a drive, a semantic map or the folder of a run, a point map or cloud, a vector
+    PATH is a drive, a semantic map (also s3://BUCKET/PREFIX) or the folder of a run, a point map or cloud, a vector
     map, or a mask PNG with its JSON. A vector map's provenance is shortened; --json has all of it.
     """
     from hdmap_tools.config import Config

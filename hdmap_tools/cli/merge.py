@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from hdmap_tools.cli import options
 
+if TYPE_CHECKING:
+    from hdmap_tools.fusion.map_location import MapLocation
+
 
 @click.command()
-@click.argument("maps", type=options.PATH, nargs=-1, required=True)
-@click.option("-o", "--out", type=options.PATH, required=True, help="Semantic map to make.")
-@click.option("--subtract", type=options.PATH, multiple=True, help="Take this map out; repeatable.")
+@click.argument("maps", type=options.MAP, nargs=-1, required=True)
+@click.option(
+    "-o",
+    "--out",
+    type=options.MAP,
+    required=True,
+    help="Semantic map to make: a folder, or s3://BUCKET/PREFIX.",
+)
+@click.option("--subtract", type=options.MAP, multiple=True, help="Take this map out; repeatable.")
 @click.option("--force", is_flag=True, help="Add a drive that is in the sum already once more.")
 @options.overwrite_option
-def command(maps: tuple[Path, ...], out: Path, subtract: tuple[Path, ...], **given: Any) -> None:
+def command(
+    maps: tuple[MapLocation, ...],
+    out: MapLocation,
+    subtract: tuple[MapLocation, ...],
+    **given: Any,
+) -> None:
     """Add semantic maps: the sum equals the map built from all drives at once.
 
     \b

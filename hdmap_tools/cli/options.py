@@ -17,7 +17,31 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-PATH = click.Path(path_type=Path)
+
+class _LocalPath(click.Path):
+    """A path of this machine."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from hdmap_tools.fusion.map_location import is_s3_address
+
+        if isinstance(value, str) and is_s3_address(value):
+            self.fail(f"{value} lies in S3, where only semantic maps can; give a path.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class _MapPath(click.Path):
+    """Where a semantic map lies: a path, or s3://BUCKET/PREFIX."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from hdmap_tools.fusion.map_location import is_s3_address, map_location
+
+        if isinstance(value, str) and is_s3_address(value):
+            return map_location(value)
+        return super().convert(value, param, ctx)
+
+
+PATH: Final = _LocalPath(path_type=Path)
+MAP: Final = _MapPath(path_type=Path)
 
 
 def config_options(function: F) -> F:

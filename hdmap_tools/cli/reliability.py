@@ -10,7 +10,7 @@ from hdmap_tools.cli import options
 
 
 @click.command()
-@click.argument("semantic_map", type=options.PATH)
+@click.argument("semantic_map", type=options.MAP)
 @click.option(
     "--truth",
     type=options.PATH,

@@ -10,7 +10,7 @@ from hdmap_tools.cli import options
 
 
 @click.command()
-@click.argument("semantic_map", type=options.PATH)
+@click.argument("semantic_map", type=options.MAP)
 @click.option("-o", "--out", type=options.PATH, required=True, help="GeoPackage to make.")
 @options.vectorizer_option
 @options.confusion_option

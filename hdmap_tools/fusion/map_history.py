@@ -54,15 +54,15 @@ def find_version(semantic_map: SemanticMap, name: str) -> Version:
         return found[0]
     why = f"{len(found)} versions begin so" if found else f"it has {len(versions)} versions"
     raise StoreError(
-        f"The map at {semantic_map.path} has no version {name!r}: {why}. `hdmap history` lists them; "
+        f"The map at {semantic_map.location} has no version {name!r}: {why}. `hdmap history` lists them; "
         f"give at least {_MIN_PREFIX} characters of an id, or a number of commits back."
     )
 
 
 def changes_between(semantic_map: SemanticMap, before: Version, after: Version) -> MapChanges:
     """What differs between two versions."""
-    old = SemanticMap.open(semantic_map.path, before.id)
-    new = SemanticMap.open(semantic_map.path, after.id)
+    old = SemanticMap.open(semantic_map.location, before.id)
+    new = SemanticMap.open(semantic_map.location, after.id)
     frames = {
         drive: difference
         for drive in sorted(old.drives.keys() | new.drives.keys())
@@ -88,7 +88,7 @@ def roll_back(semantic_map: SemanticMap, version: Version) -> str:
     Raises:
         StoreError: If the map cannot be read or written.
     """
-    earlier = SemanticMap.open(semantic_map.path, version.id)
+    earlier = SemanticMap.open(semantic_map.location, version.id)
     tiles = ((index, theirs) for index, _, theirs in _both(semantic_map, earlier))
     message = f"Roll back to {version.id} ({version.message})"
     return semantic_map.replace(tiles, earlier.drives, message, {ROLLED_BACK_TO: version.id})
@@ -117,7 +117,7 @@ def drive_without_others(semantic_map: SemanticMap, drive_id: str) -> dict[TileI
     held = semantic_map.drives
     if drive_id not in held:
         raise MapMismatchError(
-            f"The map at {semantic_map.path} does not hold {drive_id!r}; it holds "
+            f"The map at {semantic_map.location} does not hold {drive_id!r}; it holds "
             f"{', '.join(sorted(held)) or 'no drive'}."
         )
     total: dict[TileIndex, dict[str, NDArrayAny]] = {}
@@ -130,8 +130,8 @@ def drive_without_others(semantic_map: SemanticMap, drive_id: str) -> dict[TileI
                 f"Version {after.id} ({after.message}) changed {drive_id} together with others, so what it "
                 "added alone is not known; build its map and subtract that (`hdmap merge --subtract`)."
             )
-        old = SemanticMap.open(semantic_map.path, before.id)
-        new = SemanticMap.open(semantic_map.path, after.id)
+        old = SemanticMap.open(semantic_map.location, before.id)
+        new = SemanticMap.open(semantic_map.location, after.id)
         for index, mine, theirs in _both(old, new):
             # Signed: the drive may have been taken out and added again.
             added = {n: theirs.layers[n].astype(np.int64) - mine.layers[n] for n in LAYERS}

@@ -7,6 +7,7 @@ error, never a wrong count.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,12 +26,15 @@ from hdmap_tools.fusion.cell_counts import (
     combine_tiles,
 )
 from hdmap_tools.fusion.map_meta import MapMeta
+from hdmap_tools.fusion.s3_errors import is_outage
 from hdmap_tools.types import NDArrayAny
 
 if TYPE_CHECKING:
     import icechunk
     import zarr
 
+_CODE: Final = re.compile(r'code: "([^"]+)"(?:, message: "([^"]+)")?')
+"""In an answer of S3."""
 _HALF: Final = LATTICE_CELLS // 2
 _REQUIRED_FOLDERS: Final = {"refs", "snapshots"}
 _KNOWN_FOLDERS: Final = _REQUIRED_FOLDERS | {"chunks", "manifests", "transactions", "config.yaml"}
@@ -78,7 +82,7 @@ def store_errors(what: str) -> Iterator[None]:
         icechunk.IcechunkError,
         icechunk.ConflictError,
     ) as error:
-        raise StoreError(f"{what}: {_one_line(error)}.") from error
+        raise StoreError(f"{what}: {root_cause(error)}.") from error
 
 
 def make_arrays(group: zarr.Group, meta: MapMeta) -> None:
@@ -127,13 +131,19 @@ def read_tile(group: zarr.Group, index: TileIndex) -> Tile:
 
 
 def read_layer(group: zarr.Group, name: str, index: TileIndex) -> NDArrayAny | None:
-    """One layer of a tile; None if its chunk is damaged."""
+    """One layer of a tile; None if its chunk is damaged or gone.
+
+    Raises:
+        StoreError: If it cannot be told, as its storage cannot be reached.
+    """
     rows, cols = _region(index)
     try:
-        with store_errors("damaged"):
+        with store_errors(f"Layer {name} of tile {index} cannot be read"):
             array: Any = group[name]
             return np.asarray(array[..., rows, cols])
-    except StoreError:
+    except StoreError as error:
+        if is_outage(str(error.__cause__)):
+            raise
         return None
 
 
@@ -159,7 +169,13 @@ def add_to_tile(fork: Any, index: TileIndex, parts: Iterable[Tile]) -> None:
     write_tile(group, index, total)
 
 
-def _one_line(error: BaseException) -> str:
-    """The first words of a library's message, without its own decoration."""
-    first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    return first.strip().removeprefix("x ").strip().rstrip(".")[:200]
+def root_cause(error: BaseException) -> str:
+    """The words of a library's message that say most, in one line, without its decoration."""
+    lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    # Icechunk draws the chain of causes below its message; the last one is the deepest.
+    _, is_chain, deepest = lines[-1].partition("`-> ")
+    if is_chain and (told := _CODE.search(deepest)):
+        return ": ".join(part for part in told.groups() if part).rstrip(".")
+    first = lines[0].strip().removeprefix("x ").strip().rstrip(".")[:200]
+    deepest = deepest.strip().rstrip(".")[:200]
+    return first if not deepest or deepest in first else f"{first}: {deepest}"

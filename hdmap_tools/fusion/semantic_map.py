@@ -1,8 +1,8 @@
-"""The semantic map on disk: counts in an Icechunk repository, a version for every commit.
+"""The semantic map: counts in an Icechunk repository on disk or in S3, a version for every commit.
 
 The Zarr v3 group holds the arrays of `map_store`, and in its attributes the map's meta and the
 drives that it holds.
-On a local disk exactly one process may commit at a time.
+On a local disk exactly one process may commit at a time; in S3 the second one is refused.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import ValidationError
 
-from hdmap_tools.errors import HDMapError, MapMismatchError, OutputExistsError, StoreError
+from hdmap_tools.errors import HDMapError, MapMismatchError, StoreError
 from hdmap_tools.fusion.cell_counts import (
     LAYERS,
     CellCounts,
@@ -27,12 +27,12 @@ from hdmap_tools.fusion.cell_counts import (
     shift_heights,
     window_of_tiles,
 )
+from hdmap_tools.fusion.map_location import MAIN, MapLocation, branch_of
 from hdmap_tools.fusion.map_meta import MAP_SCHEMA_VERSION, MapMeta
+from hdmap_tools.fusion.map_repository import make_repository, open_repository, tip_of
 from hdmap_tools.fusion.map_store import (
-    is_semantic_map,
     listed_tiles,
     make_arrays,
-    quiet_icechunk,
     read_layer,
     read_tile,
     store_errors,
@@ -44,8 +44,6 @@ from hdmap_tools.types import NDArrayAny
 if TYPE_CHECKING:
     import icechunk
     import zarr
-
-_BRANCH: Final = "main"
 
 ROLLED_BACK_TO: Final = "rolled_back_to"
 """In a version's metadata: the id of the earlier one that it equals."""
@@ -72,63 +70,70 @@ class Version:
 
 
 class SemanticMap:
-    """A probabilistic map on disk; `create` or `open` one.
+    """A probabilistic map on disk or in S3; `create` or `open` one.
 
     Attributes:
-        path: Folder of the repository.
+        location: Of the repository.
         meta: What its counts mean.
     """
 
     def __init__(
-        self, path: Path, repository: icechunk.Repository, meta: MapMeta, version: str | None
+        self,
+        location: MapLocation,
+        repository: icechunk.Repository,
+        meta: MapMeta,
+        version: str | None,
     ) -> None:
-        self.path = path
+        self.location = location
         self.meta = meta
         self._repository = repository
         self._version = version
+        self._branch = branch_of(location)
+        # A map that is not finished has one writer; what another one commits is not gone on from.
+        self._expected = None if self._branch == MAIN else tip_of(repository, self._branch)
 
     @classmethod
-    def create(cls, path: Path, meta: MapMeta) -> SemanticMap:
+    def create(
+        cls, location: MapLocation, meta: MapMeta, note: dict[str, Any] | None = None
+    ) -> SemanticMap:
         """Make an empty map.
+
+        Args:
+            location: Where; nothing is there yet.
+            meta: What its counts will mean.
+            note: Metadata of the first version.
 
         Raises:
             OutputExistsError: If something is there already.
-            StoreError: If the folder cannot be written.
+            StoreError: If it cannot be written.
         """
-        icechunk = quiet_icechunk()
         import zarr
 
-        if path.exists():
-            raise OutputExistsError(f"{path} exists already; choose another name.")
-        with store_errors(f"Cannot make a map at {path}"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            repository = icechunk.Repository.create(icechunk.local_filesystem_storage(str(path)))
-            session = repository.writable_session(_BRANCH)
+        with store_errors(f"Cannot make a map at {location}"):
+            repository = make_repository(location)
+            session = repository.writable_session(branch_of(location))
             group = zarr.create_group(store=session.store)
             group.attrs["meta"] = meta.model_dump(mode="json")
             group.attrs["drives"] = {}
             group.attrs["num_tiles"] = 0
             make_arrays(group, meta)
-            session.commit("Empty map")
-        return cls(path, repository, meta, None)
+            session.commit("Empty map", metadata=note or {})
+            return cls(location, repository, meta, None)
 
     @classmethod
-    def open(cls, path: Path, version: str | None = None) -> SemanticMap:
+    def open(cls, location: MapLocation, version: str | None = None) -> SemanticMap:
         """Open a map, at its newest version or at an older one (read-only).
 
         Raises:
-            StoreError: If there is no map, its schema is newer than ours, or it is damaged.
+            StoreError: If there is no map, its schema is newer than ours, it is damaged, or S3
+                cannot be asked.
         """
-        icechunk = quiet_icechunk()
         import zarr
 
-        if not is_semantic_map(path):
-            found = "nothing" if not path.exists() else "something else"
-            raise StoreError(f"No semantic map at {path} (found {found}); `hdmap build` makes one.")
-        with store_errors(f"Cannot open the map at {path}"):
-            repository = icechunk.Repository.open(icechunk.local_filesystem_storage(str(path)))
+        with store_errors(f"Cannot open the map at {location}"):
+            repository = open_repository(location)
             session = (
-                repository.readonly_session(_BRANCH)
+                repository.readonly_session(branch_of(location))
                 if version is None
                 else repository.readonly_session(snapshot_id=version)
             )
@@ -136,7 +141,7 @@ class SemanticMap:
         found_version = document.get("schema_version") if isinstance(document, dict) else None
         if found_version != MAP_SCHEMA_VERSION:
             raise StoreError(
-                f"The map at {path} has schema version {found_version}, this release reads "
+                f"The map at {location} has schema version {found_version}, this release reads "
                 f"{MAP_SCHEMA_VERSION}; open it with the release that wrote it."
             )
         try:
@@ -144,9 +149,9 @@ class SemanticMap:
         except ValidationError as error:
             fields = ", ".join(".".join(map(str, e["loc"])) for e in error.errors())
             raise StoreError(
-                f"The map at {path} has a damaged description ({fields}); build it anew."
+                f"The map at {location} has a damaged description ({fields}); build it anew."
             ) from error
-        return cls(path, repository, meta, version)
+        return cls(location, repository, meta, version)
 
     @property
     def drives(self) -> Drives:
@@ -156,7 +161,9 @@ class SemanticMap:
 
     def history(self) -> list[Version]:
         """All versions, newest first."""
-        start = {"branch": _BRANCH} if self._version is None else {"snapshot_id": self._version}
+        start = (
+            {"branch": self._branch} if self._version is None else {"snapshot_id": self._version}
+        )
         with self._reading():
             return [
                 Version(info.id, info.written_at, info.message, dict(info.metadata))
@@ -172,7 +179,7 @@ class SemanticMap:
         # The store's own index of chunks carries no checksum.
         if len(found) != expected:
             raise StoreError(
-                f"The map at {self.path} is damaged: it lists {len(found)} tiles and should hold {expected}; "
+                f"The map at {self.location} is damaged: it lists {len(found)} tiles and should hold {expected}; "
                 "build it anew or take a copy."
             )
         return found
@@ -345,7 +352,7 @@ class SemanticMap:
                 )
             return theirs
 
-        message = f"Merge {name or other.path.name}"
+        message = f"Merge {name or other.location.name}"
         return self._apply(other._all_tiles(), self._shift_mm(other.meta), 1, message, checked)
 
     def subtract(self, other: SemanticMap, name: str = "") -> str:
@@ -355,7 +362,7 @@ class SemanticMap:
             MapMismatchError: If this map does not hold the other's drives and counts.
         """
         self.meta.require_compatible(other.meta)
-        theirs, called = other.drives, name or other.path.name
+        theirs, called = other.drives, name or other.location.name
 
         def checked(held: Drives) -> Drives:
             missing = sorted(theirs.keys() - held.keys())
@@ -433,15 +440,21 @@ class SemanticMap:
     def _writing(self) -> Iterator[icechunk.Session]:
         """A session to write in and commit; discarded if that is refused."""
         if self._version is not None:
-            raise StoreError(f"{self.path} is open at an old version, which cannot be changed.")
+            raise StoreError(f"{self.location} is open at an old version, which cannot be changed.")
         failed = (
-            f"Could not commit to {self.path}, the map is as it was before (check free space, and that no "
+            f"Could not commit to {self.location}, the map is as it was before (check free space, and that no "
             "other process writes it)"
         )
         with store_errors(failed):
-            session = self._repository.writable_session(_BRANCH)
+            session = self._repository.writable_session(self._branch)
+            if self._expected not in (None, session.snapshot_id):
+                raise StoreError(
+                    f"Another process is making {self.location}; wait for it, or choose another name."
+                )
             try:
                 yield session
+                if self._expected is not None:
+                    self._expected = session.snapshot_id
             except HDMapError:
                 session.discard_changes()
                 raise
@@ -449,16 +462,17 @@ class SemanticMap:
     @contextmanager
     def _reading(self, tile: TileIndex | None = None) -> Iterator[None]:
         failed = (
-            f"The map at {self.path} is damaged or cannot be read; build it anew or take a copy"
+            f"The map at {self.location} is damaged or cannot be read; build it anew or take a copy"
         )
         if tile is not None:
-            failed = f"Tile {tile} of the map at {self.path} is damaged; `hdmap build --repair` counts it again"
+            state = "is damaged" if isinstance(self.location, Path) else "cannot be read"
+            failed = f"Tile {tile} of the map at {self.location} {state}; `hdmap build --repair` counts damaged ones again"
         with store_errors(failed):
             yield
 
     def _session(self) -> icechunk.Session:
         if self._version is None:
-            return self._repository.readonly_session(_BRANCH)
+            return self._repository.readonly_session(self._branch)
         return self._repository.readonly_session(snapshot_id=self._version)
 
     def _group(self) -> zarr.Group:

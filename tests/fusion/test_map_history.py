@@ -107,6 +107,6 @@ def test_a_drive_is_added_twice_only_where_that_is_asked_for(week, tmp_path):
 
 
 def test_an_old_version_cannot_be_changed(week):
-    old = SemanticMap.open(week.path, week.history()[1].id)
+    old = SemanticMap.open(week.location, week.history()[1].id)
     with pytest.raises(StoreError, match="old version"):
         roll_back(old, week.history()[2])

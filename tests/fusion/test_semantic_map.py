@@ -20,7 +20,7 @@ def stored(tmp_path):
 
 
 def test_what_is_stored_comes_back_exactly(stored):
-    opened = SemanticMap.open(stored.path)
+    opened = SemanticMap.open(stored.location)
     assert opened.meta == meta()
     assert opened.read().equals(counts_of(frames_of(1, 3)))
     assert opened.tile_indices() == tuple(sorted(counts_of(frames_of(1, 3)).tiles))
@@ -57,7 +57,7 @@ def test_old_versions_stay_readable(stored):
     first = stored.history()[0]
     stored.add(counts_of(frames_of(2, 1)), "drive-2")
     assert [v.message for v in stored.history()][:3] == ["Add drive-2", "Add drive-1", "Empty map"]
-    old = SemanticMap.open(stored.path, first.id)
+    old = SemanticMap.open(stored.location, first.id)
     assert old.read().equals(counts_of(frames_of(1, 3)))
     with pytest.raises(StoreError, match="old version"):
         old.add(counts_of(frames_of(3, 1)), "drive-3")
@@ -100,14 +100,14 @@ def test_a_refused_subtraction_changes_nothing(stored, tmp_path):
 
 def test_an_existing_map_is_never_overwritten(stored):
     with pytest.raises(OutputExistsError, match="exists already"):
-        SemanticMap.create(stored.path, meta())
-    assert SemanticMap.open(stored.path).drives
+        SemanticMap.create(stored.location, meta())
+    assert SemanticMap.open(stored.location).drives
 
 
 def test_what_has_other_things_in_it_is_no_map(stored):
-    assert is_semantic_map(stored.path)
-    (stored.path / "thesis.txt").write_text("x")
-    assert not is_semantic_map(stored.path)
+    assert is_semantic_map(stored.location)
+    (stored.location / "thesis.txt").write_text("x")
+    assert not is_semantic_map(stored.location)
 
 
 def test_opening_nothing_says_so(tmp_path):
@@ -117,11 +117,11 @@ def test_opening_nothing_says_so(tmp_path):
 
 @pytest.mark.parametrize("part", ["snapshots", "refs"])
 def test_a_damaged_map_says_so(stored, part):
-    for file in (stored.path / part).rglob("*"):
+    for file in (stored.location / part).rglob("*"):
         if file.is_file():
             file.write_bytes(b"not what it was")
     with pytest.raises(StoreError, match="Cannot open the map"):
-        SemanticMap.open(stored.path)
+        SemanticMap.open(stored.location)
 
 
 def flip_a_byte(path):
@@ -149,7 +149,7 @@ def test_damage_to_the_counts_is_found_never_read(tmp_path, part, harm):
     stored.add(counts_of(dense), "drive-1")
     expected = stored.read()
     found = 0
-    for file in sorted((stored.path / part).rglob("*")):
+    for file in sorted((stored.location / part).rglob("*")):
         if not file.is_file():
             continue
         content = file.read_bytes()
@@ -161,20 +161,20 @@ def test_damage_to_the_counts_is_found_never_read(tmp_path, part, harm):
             file.write_bytes(b"")
         else:
             file.unlink()
-        said = error_of_reading(stored.path, expected)
+        said = error_of_reading(stored.location, expected)
         if said is not None:
             found += 1
-            assert str(stored.path) in said
+            assert str(stored.location) in said
             assert "\n" not in said
         file.write_bytes(content)
     # Every chunk and manifest of the newest version is read, so its damage is found.
     assert found > 0
-    assert SemanticMap.open(stored.path).read().equals(expected)
+    assert SemanticMap.open(stored.location).read().equals(expected)
 
 
 def test_two_that_write_at_once_do_not_overwrite_each_other(stored):
     other, more = (
-        SemanticMap.open(stored.path),
+        SemanticMap.open(stored.location),
         counts_of([(7, random_frame(np.random.default_rng(7)))]),
     )
     expected = stored.read().merge(more)
@@ -185,7 +185,7 @@ def test_two_that_write_at_once_do_not_overwrite_each_other(stored):
 
     with pytest.raises(StoreError, match="no other process writes it"):
         stored.replace(tiles_while_another_commits(), {}, "Replace", {})
-    for one in (stored, other, SemanticMap.open(stored.path)):
+    for one in (stored, other, SemanticMap.open(stored.location)):
         assert one.read().equals(expected)
         assert one.history()[0].message == "Add drive-of-another"
 
@@ -227,7 +227,7 @@ def test_a_newer_schema_is_refused(tmp_path):
     group.attrs["meta"] = json.loads(json.dumps(group.attrs["meta"])) | {"schema_version": 99}
     session.commit("from the future")
     with pytest.raises(StoreError, match="schema version 99"):
-        SemanticMap.open(semantic_map.path)
+        SemanticMap.open(semantic_map.location)
 
 
 def test_an_empty_map_has_no_grid(tmp_path):
@@ -240,5 +240,5 @@ def test_an_empty_map_has_no_grid(tmp_path):
 
 
 def test_a_map_that_was_moved_still_opens(stored, tmp_path):
-    shutil.move(stored.path, tmp_path / "moved")
+    shutil.move(stored.location, tmp_path / "moved")
     assert SemanticMap.open(tmp_path / "moved").read().equals(counts_of(frames_of(1, 3)))
