@@ -23,6 +23,8 @@ def values_of(column: Any) -> NDArrayAny:
             return _joined([np.from_dlpack(chunk) for chunk in chunks], column)
         if pa.types.is_boolean(column.type):
             return _joined([_bits_of(chunk) for chunk in chunks], column)
+        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
+            return np.array(column.to_pylist(), dtype=object)
     return np.asarray(column.to_numpy())
 
 
