@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from hdmap_tools.config import Config
+    from hdmap_tools.distributed.cluster import Workers
     from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -150,6 +151,50 @@ def resolution_option(function: F) -> F:
     return click.option("--resolution", type=float, help="Cell size, metres [default: 0.1].")(
         function
     )
+
+
+def worker_options(shared: str) -> Callable[[F], F]:
+    """--workers, --scheduler and --worker-memory.
+
+    Args:
+        shared: What workers of a scheduler must find where this process does.
+    """
+
+    def added(function: F) -> F:
+        for option in (
+            click.option(
+                "--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB."
+            ),
+            click.option(
+                "--scheduler",
+                metavar="ADDRESS",
+                help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find "
+                f"{shared} under the same paths.",
+            ),
+            click.option(
+                "--workers",
+                type=click.IntRange(min=1),
+                help="Spread the drive over so many processes of this machine.",
+            ),
+        ):
+            function = option(function)
+        return function
+
+    return added
+
+
+def workers_of(given: dict[str, Any]) -> Workers | None:
+    """The workers asked for; None if none were."""
+    from hdmap_tools.distributed.cluster import Workers
+
+    number, scheduler, memory = given["workers"], given["scheduler"], given["worker_memory"]
+    if number is not None and scheduler is not None:
+        raise click.UsageError("Give --workers or --scheduler, not both.")
+    if memory is not None and number is None:
+        raise click.UsageError("--worker-memory needs --workers.")
+    if number is None and scheduler is None:
+        return None
+    return Workers(number or 0, scheduler, memory)
 
 
 def origin_option(function: F) -> F:

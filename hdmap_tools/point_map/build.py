@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -73,18 +75,16 @@ def build_point_map(
         raise PointMapError("A point map needs at least one drive, found none.")
     for posed in drives[1:]:
         drives[0].drive.frame.require_same(posed.drive.frame)
-    usable = tuple(
-        tuple(posed.drive.sweeps[number] for number in posed.usable_sweeps(max_pose_gap_s))
-        for posed in drives
-    )
+    usable = tuple(posed.usable_sweeps(max_pose_gap_s) for posed in drives)
     names = [posed.drive.id for posed in drives]
     if len(set(names)) < len(names):
         raise PointMapError("Two of the drives have the same id; give each drive once.")
     told = _Counter(progress, (2 if config.remove_moving else 1) * sum(map(len, usable)))
-    with tempfile.TemporaryDirectory(prefix=".aside.", dir=folder.parent) as aside:
-        site = Site(tuple(drives), usable, config, Path(aside), _READERS, told.one_more)
+    folder = folder.absolute()
+    with _put_aside(folder.parent) as aside:
+        site = Site(tuple(drives), usable, config, aside, _READERS, told.one_more)
         crew = crew_at(site)
-        runs = [run for k, refs in enumerate(usable) for run in crew.runs(k, len(refs))]
+        runs = [run for k, numbers in enumerate(usable) for run in crew.runs(k, len(numbers))]
         responses, asphalt = _intensity_responses(crew, site)
         num_ground = 0
         files: Files = {}
@@ -104,6 +104,8 @@ def build_point_map(
             looked = crew.over_runs(look_through, [(run, lidars[run.drive]) for run in runs])
             for found in looked:
                 _add_files(seen, found)
+        for name in ("tiles", "cells"):
+            (folder / name).mkdir()
         finished = crew.over_tiles(
             finish_tile, ((index, seen.get(index, ()), folder) for index in sorted(files))
         )
@@ -126,6 +128,21 @@ def build_point_map(
         return PointMap.created(folder, meta, finished, trajectories)
 
 
+@contextmanager
+def _put_aside(parent: Path) -> Iterator[Path]:
+    """A folder for what is put aside, gone with the block.
+
+    It gets another name first: a worker that has not heard that the build failed finds it
+    gone, and cannot add to what is being deleted.
+    """
+    aside = Path(tempfile.mkdtemp(prefix=".aside.", dir=parent))
+    try:
+        yield aside
+    finally:
+        gone = aside.rename(aside.with_name(f"{aside.name}.gone"))
+        shutil.rmtree(gone, ignore_errors=True)
+
+
 def _add_files(files: Files, more: Files) -> None:
     for index, paths in more.items():
         files[index] = (*files.get(index, ()), *paths)
@@ -138,13 +155,10 @@ def _intensity_responses(
     if not site.config.normalize_intensity:
         return [None] * len(site.drives), None
     some = []
-    for drive, refs in enumerate(site.usable):
-        every = -(-len(refs) // _SWEEPS_FOR_INTENSITY)
-        for part in crew.runs(drive, -(-len(refs) // every)):
-            numbers = part.numbers
-            some.append(
-                (Run(drive, range(numbers.start * every, len(refs), every)[: len(numbers)]),)
-            )
+    for drive, usable in enumerate(site.usable):
+        numbers = range(len(usable))[:: -(-len(usable) // _SWEEPS_FOR_INTENSITY)]
+        for part in crew.runs(drive, len(numbers)):
+            some.append((Run(drive, numbers[part.numbers.start : part.numbers.stop]),))
     statistics = [IntensityStatistics() for _ in site.drives]
     for drive, found in crew.over_runs(asphalt_of, some):
         statistics[drive].add_found(*found)

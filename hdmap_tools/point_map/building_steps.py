@@ -71,7 +71,7 @@ class Site:
 
     Attributes:
         drives: At the poses that count.
-        usable: For each drive its sweeps that have a pose.
+        usable: For each drive the numbers of its sweeps that have a pose.
         config: How the map is made.
         aside: Folder for what is put aside, the same for all processes.
         threads: That read ahead in one step; 0: none.
@@ -79,7 +79,7 @@ class Site:
     """
 
     drives: tuple[PosedDrive, ...]
-    usable: tuple[tuple[SweepRef, ...], ...]
+    usable: tuple[NDArrayInt, ...]
     config: PointsConfig
     aside: Path
     threads: int = 0
@@ -94,8 +94,8 @@ class Site:
 
     def refs(self, run: Run) -> list[SweepRef]:
         """The sweeps of a run."""
-        usable = self.usable[run.drive]
-        return [usable[number] for number in run.numbers]
+        numbers = self.usable[run.drive][run.numbers.start : run.numbers.stop : run.numbers.step]
+        return [self.drives[run.drive].drive.sweeps[number] for number in numbers]
 
     def ahead(self, make: Callable[[_Item], _Made], items: Iterable[_Item]) -> Iterator[_Made]:
         """What `make` gives for each item, in order, in threads if there are any to spare."""
@@ -183,8 +183,9 @@ def lidar_of(site: Site, drive: int) -> tuple[int, Lidar]:
     """A drive's number and its lidar, from some of its sweeps."""
     from hdmap_tools.point_map.moving import estimate_lidar_position
 
-    refs, posed = site.usable[drive], site.drives[drive]
-    some = [posed.drive.read_sweep(ref) for ref in refs[:: -(-len(refs) // _SWEEPS_FOR_LIDAR)]]
+    number = len(site.usable[drive])
+    run = Run(drive, range(0, number, -(-number // _SWEEPS_FOR_LIDAR)))
+    some = [site.drives[drive].drive.read_sweep(ref) for ref in site.refs(run)]
     gaps = [ring_gap_deg(sweep.points_ego, sweep.ring) for sweep in some]
     return drive, Lidar(estimate_lidar_position(some), float(np.median(gaps)))
 
@@ -302,7 +303,11 @@ def finish_tile(
     voxels = read_voxels([site.voxels_of(index)])
     if seen:
         voxels = voxels.keep(~is_moving(voxels, Blocks.read(site.blocks_of(index)), seen))
-    return write_tile(folder, index, made_tile(voxels, site.grid))
+    made = site.new_folder()
+    written = write_tile(made, index, made_tile(voxels, site.grid))
+    for path in made.glob("*/*"):
+        os.replace(path, folder / path.relative_to(made))
+    return written
 
 
 def made_tile(voxels: Voxels, grid: VoxelGrid) -> PointTile:

@@ -192,6 +192,7 @@ class PointMap:
         Raises:
             PointMapError: If there is no point at all.
         """
+        path.mkdir(parents=True, exist_ok=True)
         written = (write_tile(path, index, tile) for index, tile in tiles)
         return cls.created(path, meta, written, trajectories)
 
@@ -204,7 +205,7 @@ class PointMap:
         trajectories: Mapping[str, Trajectory] | None = None,
     ) -> PointMap:
         """As `create`, of tiles that lie in the folder: each as `write_tile` says it."""
-        (path / "poses").mkdir(parents=True, exist_ok=True)
+        (path / "poses").mkdir(exist_ok=True)
         written = [tile for tile in tiles if tile is not None]
         if not written:
             raise PointMapError(
@@ -441,7 +442,7 @@ def _tile_name(index: TileIndex) -> str:
 
 
 def write_tile(path: Path, index: TileIndex, tile: PointTile) -> TileOfPoints | None:
-    """Write one tile into the folder of a point map; each file is whole or not there.
+    """Write one tile into a folder.
 
     Returns:
         What the map is to say of it; None if it is empty, which is not written.
@@ -454,7 +455,7 @@ def write_tile(path: Path, index: TileIndex, tile: PointTile) -> TileOfPoints | 
     cells = (tile.ground_cells, tile.ground_height_mm, tile.roughness_mm, tile.ground_points)
     ground = dict(zip(_CELL_COLUMNS, cells, strict=True))
     for name in ("tiles", "cells"):
-        (path / name).mkdir(parents=True, exist_ok=True)
+        (path / name).mkdir(exist_ok=True)
     return TileOfPoints(
         x=index[0],
         y=index[1],
