@@ -106,17 +106,10 @@ def _repair(
 
 
 def _memory(given: dict[str, Any]) -> MemoryBudget | None:
-    from pydantic import ByteSize, TypeAdapter, ValidationError
-
     from hdmap_tools.memory_budget import MemoryBudget
 
     if given["memory"] is None:
         return None
     if given["workers"] is not None or given["scheduler"] is not None:
         raise click.UsageError("--memory is of one process; with --workers give --worker-memory.")
-    try:
-        return MemoryBudget(TypeAdapter(ByteSize).validate_python(given["memory"]))
-    except ValidationError as error:
-        raise click.UsageError(
-            f"--memory: expected a size such as 2GB, found {given['memory']!r}."
-        ) from error
+    return MemoryBudget(options.parse_bytes("--memory", given["memory"]))

@@ -194,7 +194,30 @@ def workers_of(given: dict[str, Any]) -> Workers | None:
         raise click.UsageError("--worker-memory needs --workers.")
     if number is None and scheduler is None:
         return None
+    if memory is not None:
+        memory = f"{parse_bytes('--worker-memory', memory)}B"
     return Workers(number or 0, scheduler, memory)
+
+
+def parse_bytes(option: str, text: str) -> int:
+    """Bytes, from a size such as 2GB.
+
+    Args:
+        option: That it was given for, for messages.
+        text: What was given.
+
+    Raises:
+        click.UsageError: If it is not a size above 0.
+    """
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    try:
+        size = int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        size = 0
+    if size == 0:
+        raise click.UsageError(f"{option}: expected a size such as 2GB, found {text!r}.")
+    return size
 
 
 def origin_option(function: F) -> F:
