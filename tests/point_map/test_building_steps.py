@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from hdmap_tools.config import PointsConfig
@@ -105,9 +105,7 @@ class Unsteady:
     over_tiles = over_runs
 
 
-@settings(
-    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=6, deadline=None, phases=(Phase.generate,))
 @given(seed=st.integers(0, 2**32 - 1), remove=st.booleans())
 def test_who_does_what_and_when_changes_no_byte(drives, whole, tmp_path_factory, seed, remove):
     def crew_at(site):
