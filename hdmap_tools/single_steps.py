@@ -14,7 +14,8 @@ import hdmap_tools
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.config import Config
-from hdmap_tools.distributed.build import Workers, add_segments, connected
+from hdmap_tools.distributed.build import add_segments
+from hdmap_tools.distributed.cluster import Workers, connected
 from hdmap_tools.distributed.count_segment import SegmentTask
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg

@@ -10,7 +10,6 @@ from hdmap_tools.cli import options
 
 if TYPE_CHECKING:
     from hdmap_tools.config import Config
-    from hdmap_tools.distributed.build import Workers
     from hdmap_tools.memory_budget import MemoryBudget
     from hdmap_tools.segmentation.cache import LabelCache
 
@@ -48,18 +47,9 @@ if TYPE_CHECKING:
     metavar="SIZE",
     help="Keep no more than that in memory, for example 2GB; the rest is put aside on disk.",
 )
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Spread the drive over so many processes of this machine.",
+@options.worker_options(
+    "drive, network, point map and OUT", "; OUT in S3 with the same environment"
 )
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find drive, "
-    "network, point map and OUT under the same paths; OUT in S3 with the same environment.",
-)
-@click.option("--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB.")
 @options.overwrite_option
 @options.json_option
 @options.config_options
@@ -95,7 +85,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             cache=cache,
             overwrite=given["overwrite"],
             resume=given["resume"],
-            workers=_workers(given),
+            workers=options.workers_of(given),
             memory=_memory(given),
             steps=Steps(segmented),
         )
@@ -125,30 +115,10 @@ def _repair(
 
 
 def _memory(given: dict[str, Any]) -> MemoryBudget | None:
-    from pydantic import ByteSize, TypeAdapter, ValidationError
-
     from hdmap_tools.memory_budget import MemoryBudget
 
     if given["memory"] is None:
         return None
     if given["workers"] is not None or given["scheduler"] is not None:
         raise click.UsageError("--memory is of one process; with --workers give --worker-memory.")
-    try:
-        return MemoryBudget(TypeAdapter(ByteSize).validate_python(given["memory"]))
-    except ValidationError as error:
-        raise click.UsageError(
-            f"--memory: expected a size such as 2GB, found {given['memory']!r}."
-        ) from error
-
-
-def _workers(given: dict[str, Any]) -> Workers | None:
-    from hdmap_tools.distributed.build import Workers
-
-    number, scheduler, memory = given["workers"], given["scheduler"], given["worker_memory"]
-    if number is not None and scheduler is not None:
-        raise click.UsageError("Give --workers or --scheduler, not both.")
-    if memory is not None and number is None:
-        raise click.UsageError("--worker-memory needs --workers.")
-    if number is None and scheduler is None:
-        return None
-    return Workers(number or 0, scheduler, memory)
+    return MemoryBudget(options.parse_bytes("--memory", given["memory"]))

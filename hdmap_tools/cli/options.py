@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from hdmap_tools.config import Config
+    from hdmap_tools.distributed.cluster import Workers
     from hdmap_tools.segmentation.cache import LabelCache, SegmentProgress
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -174,6 +175,74 @@ def resolution_option(function: F) -> F:
     return click.option("--resolution", type=float, help="Cell size, metres [default: 0.1].")(
         function
     )
+
+
+def worker_options(shared: str, more: str = "") -> Callable[[F], F]:
+    """--workers, --scheduler and --worker-memory.
+
+    Args:
+        shared: What workers of a scheduler must find where this process does.
+        more: What else they need.
+    """
+
+    def added(function: F) -> F:
+        for option in (
+            click.option(
+                "--worker-memory", metavar="SIZE", help="Of each of the --workers, for example 2GB."
+            ),
+            click.option(
+                "--scheduler",
+                metavar="ADDRESS",
+                help="Spread it over the workers of a Dask scheduler, tcp://HOST:PORT; they must find "
+                f"{shared} under the same paths{more}.",
+            ),
+            click.option(
+                "--workers",
+                type=click.IntRange(min=1),
+                help="Spread the drive over so many processes of this machine.",
+            ),
+        ):
+            function = option(function)
+        return function
+
+    return added
+
+
+def workers_of(given: dict[str, Any]) -> Workers | None:
+    """The workers asked for; None if none were."""
+    from hdmap_tools.distributed.cluster import Workers
+
+    number, scheduler, memory = given["workers"], given["scheduler"], given["worker_memory"]
+    if number is not None and scheduler is not None:
+        raise click.UsageError("Give --workers or --scheduler, not both.")
+    if memory is not None and number is None:
+        raise click.UsageError("--worker-memory needs --workers.")
+    if number is None and scheduler is None:
+        return None
+    if memory is not None:
+        memory = f"{parse_bytes('--worker-memory', memory)}B"
+    return Workers(number or 0, scheduler, memory)
+
+
+def parse_bytes(option: str, text: str) -> int:
+    """Bytes, from a size such as 2GB.
+
+    Args:
+        option: That it was given for, for messages.
+        text: What was given.
+
+    Raises:
+        click.UsageError: If it is not a size above 0.
+    """
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    try:
+        size = int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        size = 0
+    if size == 0:
+        raise click.UsageError(f"{option}: expected a size such as 2GB, found {text!r}.")
+    return size
 
 
 def origin_option(function: F) -> F:

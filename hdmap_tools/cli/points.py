@@ -26,6 +26,7 @@ from hdmap_tools.cli import options
     multiple=True,
     help="Also write all points to this .pcd, .ply, .las or .laz file; repeatable.",
 )
+@options.worker_options("drives and OUT")
 @options.origin_option
 @options.overwrite_option
 @options.json_option
@@ -38,6 +39,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     Examples:
       hdmap points path/to/drive -o points --export points.laz
       hdmap points monday/drive friday/drive -o points
+      hdmap points path/to/drive -o points --workers 8
 
     DRIVE may also be a point cloud of the place (.pcd, .ply, .las, .laz). The folder OUT
     holds thinned points without what moved, the ground, and the poses; `hdmap run DRIVE
@@ -45,7 +47,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     """
     from hdmap_tools.point_map.make import make_points
 
-    config = options.resolve_config(given)
+    config, workers = options.resolve_config(given), options.workers_of(given)
     with options.ImageProgress(ctx.obj["progress"], "sweeps") as told:
         report = make_points(
             given["sources"],
@@ -53,6 +55,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
             config,
             exports=given["exports"],
             overwrite=given["overwrite"],
+            workers=workers,
             progress=told,
         )
     options.write_json(given["json_path"], report, overwrite=given["overwrite"])

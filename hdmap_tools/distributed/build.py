@@ -8,16 +8,13 @@ and however often a task had to be done again because its worker died.
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
+from hdmap_tools.distributed.cluster import deaths_explained, listening, queue_length, teller
 from hdmap_tools.distributed.count_segment import SegmentCounts, SegmentTask, count_segment
-from hdmap_tools.errors import ClusterError, MissingExtraError
 from hdmap_tools.frame_source import FrameCounts
 from hdmap_tools.fusion.cell_counts import TileIndex
 from hdmap_tools.fusion.map_store import add_to_tile
@@ -27,70 +24,8 @@ from hdmap_tools.segmentation.cache import SegmentProgress
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-_PROGRESS: Final = "hdmap-images"
-_ANSWERS_WITHIN_S: Final = 20.0
-_AHEAD: Final = 3
-"""Segments in the queue for each worker: one at work, two that wait while tiles are written."""
 _AT_ONCE: Final = 10
 """Priority of what is short and waited for, before segments."""
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Where a build is spread.
-
-    Attributes:
-        number: Processes on this machine; 0 with a scheduler.
-        scheduler: Address of a Dask scheduler that runs already, ``tcp://host:port``.
-        memory: Limit of each process on this machine, as Dask writes it (``2GB``).
-    """
-
-    number: int = 0
-    scheduler: str | None = None
-    memory: str | None = None
-
-
-@contextmanager
-def connected(workers: Workers) -> Iterator[Client]:
-    """A client of the cluster; that of this machine is started, and ended with the block.
-
-    Raises:
-        MissingExtraError: If Dask is not installed.
-        ClusterError: If there is no scheduler at the address, or it has no workers.
-    """
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise MissingExtraError(
-            "Spreading a build needs Dask: pip install 'hdmap_tools[distributed]'."
-        ) from error
-    # Workers that come and go are reported as errors of the build, if they are any.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with ExitStack() as stack:
-        if workers.scheduler is None:
-            cluster = LocalCluster(
-                n_workers=workers.number,
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=workers.memory or "auto",
-                dashboard_address=None,
-                silence_logs=logging.ERROR,
-            )
-            yield stack.enter_context(Client(stack.enter_context(cluster)))
-            return
-        try:
-            client = stack.enter_context(Client(workers.scheduler, timeout=_ANSWERS_WITHIN_S))
-        except (OSError, TimeoutError, ValueError) as error:
-            raise ClusterError(
-                f"No Dask scheduler answers at {workers.scheduler} ({error or type(error).__name__}); "
-                "start one with `dask scheduler`, or take --workers N for processes of this machine."
-            ) from error
-        if not client.scheduler_info()["workers"]:
-            raise ClusterError(
-                f"The scheduler at {workers.scheduler} has no workers; start some with "
-                f"`dask worker {workers.scheduler}`."
-            )
-        yield client
 
 
 def add_segments(
@@ -118,22 +53,21 @@ def add_segments(
         HDMapError: Whatever a worker raised.
     """
     from distributed import wait
-    from distributed.scheduler import KilledWorker
 
     heard = count(counts.used + 1)
 
-    def hear(_: Any) -> None:
+    def hear() -> None:
         if segmented is not None:
             segmented(next(heard), task.num_images)
 
-    client.subscribe_topic(_PROGRESS, hear)
     waiting, counting = list(numbers), set[Any]()
-    try:
+    kept = "What was committed is kept, and the same command goes on from there."
+    with deaths_explained(kept), listening(client, hear) as name:
         ready: list[Any] = []
         while waiting or counting or ready:
-            room = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
+            room = queue_length(client)
             while waiting and len(counting) < room:
-                counting.add(client.submit(_count, task, waiting.pop(0), pure=False))
+                counting.add(client.submit(_count, task, waiting.pop(0), name, pure=False))
             if not ready:
                 wait(counting, return_when="FIRST_COMPLETED")
                 ready = [future for future in counting if future.done()]
@@ -146,14 +80,6 @@ def add_segments(
             for outline in outlines:
                 counts.used += outline.num_frames
                 counts.observations.update(outline.observations)
-    except KilledWorker as error:
-        raise ClusterError(
-            "Workers died again and again on one part of the drive; most often they run out of "
-            "memory: give each more, or take fewer (--workers). What was committed is kept, and the "
-            "same command goes on from there."
-        ) from error
-    finally:
-        client.unsubscribe_topic(_PROGRESS)
 
 
 @dataclass(frozen=True)
@@ -164,10 +90,8 @@ class _Outline:
     tiles: tuple[TileIndex, ...]
 
 
-def _count(task: SegmentTask, number: int) -> SegmentCounts:
-    from distributed import get_worker
-
-    return count_segment(task, number, partial(get_worker().log_event, _PROGRESS, 1))
+def _count(task: SegmentTask, number: int, name: str) -> SegmentCounts:
+    return count_segment(task, number, teller(name))
 
 
 def _outline(counts: SegmentCounts) -> _Outline:

@@ -9,10 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from hdmap_tools.config import Config
-from hdmap_tools.point_map.build import PosedDrive, Progress, build_point_map
+from hdmap_tools.point_map.build import Progress, build_point_map
 from hdmap_tools.point_map.from_cloud import build_from_file
 from hdmap_tools.point_map.point_files import is_point_file
 from hdmap_tools.point_map.point_map import PointMap
+from hdmap_tools.point_map.posed_drive import PosedDrive
 from hdmap_tools.point_map.refine_config import RefineReport
 from hdmap_tools.readers.drive import Drive
 

@@ -12,7 +12,7 @@ import numpy as np
 from hdmap_tools.config import PointsConfig
 from hdmap_tools.errors import PointMapError
 from hdmap_tools.geometry.map_frame import MapFrame
-from hdmap_tools.point_map.build import made_tile
+from hdmap_tools.point_map.building_steps import made_tile
 from hdmap_tools.point_map.point_files import PointCloud, read_point_file
 from hdmap_tools.point_map.point_map import PointMap, PointMapMeta
 from hdmap_tools.types import NDArrayBool, NDArrayFloat
@@ -41,7 +41,7 @@ def build_from_file(path: Path, folder: Path, config: PointsConfig, frame: MapFr
         PointMapError: If the file has no usable points, or no ground.
         CRSMismatchError: If the file is georeferenced and the frame is not.
     """
-    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles
+    from hdmap_tools.point_map.thinning import VoxelGrid, VoxelTiles, read_voxels
 
     cloud = read_point_file(path)
     if cloud.num_dropped:
@@ -78,8 +78,8 @@ def build_from_file(path: Path, folder: Path, config: PointsConfig, frame: MapFr
             part = slice(start, start + _CHUNK)
             near = np.zeros(len(intensity[part]))
             tiles.add(points_city[part], intensity[part], is_ground[part], near)
-        tiles.finish()
-        made = ((i, made_tile(tiles.voxels(i), tiles.grid)) for i in tiles.tile_indices())
+        files = tiles.finish()
+        made = ((i, made_tile(read_voxels(paths), tiles.grid)) for i, paths in files.items())
         return PointMap.create(folder, meta, made)
 
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from hdmap_tools.config import Config
+from hdmap_tools.distributed.cluster import Workers, connected
+from hdmap_tools.distributed.points import spread_over
 from hdmap_tools.errors import ConfigError, PointMapError
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.opening import open_configured
 from hdmap_tools.output_folder import result_folder
 from hdmap_tools.point_map.build import Progress, build_point_map
+from hdmap_tools.point_map.building_steps import Alone, Crew, Site
 from hdmap_tools.point_map.for_drive import posed_drives
 from hdmap_tools.point_map.from_cloud import build_from_file
 from hdmap_tools.point_map.point_files import check_writable, is_point_file, write_point_file
@@ -30,6 +34,7 @@ def make_points(
     *,
     exports: Sequence[Path] = (),
     overwrite: bool = False,
+    workers: Workers | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Make a point map from drives.
@@ -40,6 +45,8 @@ def make_points(
         config: `points`, `drive` and the place on earth.
         exports: Files to write all points to.
         overwrite: Replace an earlier point map.
+        workers: Processes to spread it over; None: all is done in this one. Poses are
+            refined in this one in any case.
         progress: Told of sweeps done.
 
     Returns:
@@ -53,7 +60,11 @@ def make_points(
     for path in exports:
         check_writable(path, overwrite)
     files = [path for path in sources if is_point_file(path)]
-    with result_folder(out, COMMAND, overwrite) as folder:
+    if files and workers is not None:
+        raise PointMapError(
+            f"A point cloud ({files[0].name}) is taken by one process; leave --workers and --scheduler out."
+        )
+    with result_folder(out, COMMAND, overwrite) as folder, ExitStack() as stack:
         if files:
             if len(sources) > 1:
                 raise PointMapError(
@@ -70,13 +81,19 @@ def make_points(
             names = [drive.id for drive in drives]
             posed = posed_drives(drives, config, progress)
             reports = {p.drive.id: report.model_dump() for p, report in posed if report}
+            crew_at: Callable[[Site], Crew] = Alone
+            if workers is not None:
+                client = stack.enter_context(connected(workers))
+                crew_at = stack.enter_context(spread_over(client, sources, config))
             made = build_point_map(
                 [p for p, _ in posed],
                 folder,
                 config.points,
                 max_pose_gap_s=config.drive.max_pose_gap_s,
                 progress=progress,
+                crew_at=crew_at,
             )
+            stack.close()
         for path in exports:
             parts = (made.read_tile(index).to_points(index) for index in made.tile_indices())
             write_point_file(path, parts, made.meta.frame, overwrite)

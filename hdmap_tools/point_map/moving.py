@@ -13,6 +13,7 @@ Source:
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -22,7 +23,7 @@ from numba import njit
 
 from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.point_map.point_map import TILE_MM, TileIndex
-from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, VoxelTiles, is_ground_of
+from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, is_ground_of
 from hdmap_tools.readers.drive import Sweep
 from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
@@ -44,16 +45,18 @@ _FEWEST_THROUGH: Final = 2
 _THROUGH_PER_HIT: Final = 0.5
 """Sweeps that saw through a block for each one that met it, from which it was not there to stay."""
 _TILES_IN_MEMORY: Final = 40
+_MOST: Final = np.iinfo(np.uint16).max
+"""As high as is counted."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Blocks:
+class Blocks:
     """Standing blocks of a tile.
 
     Attributes:
         of_voxel: (N,) block of each standing voxel of the tile.
         column, layer: (M,) of each block: its x-y position as one number, its height.
-        centres_city: (M, 3) float32 metres from the tile's corner.
+        centres_m: (M, 3) float32 metres from the tile's corner.
     """
 
     of_voxel: NDArrayInt
@@ -62,7 +65,7 @@ class _Blocks:
     centres_m: NDArrayFloat32
 
     @classmethod
-    def of(cls, voxels: Voxels, grid: VoxelGrid) -> _Blocks:
+    def of(cls, voxels: Voxels, grid: VoxelGrid) -> Blocks:
         """Blocks of a tile's standing voxels."""
         standing = voxels.keep(~is_ground_of(voxels))
         means_mm = grid.means_mm(standing)
@@ -75,6 +78,34 @@ class _Blocks:
         )
         layer = key % (1 << 24) - (1 << 23)
         return cls(of_voxel, key >> 24, layer, centres.astype(np.float32))
+
+    def write(self, path: Path) -> None:
+        """Keep them in a file."""
+        np.savez(
+            path,
+            of_voxel=self.of_voxel.astype(np.int32),
+            column=self.column,
+            layer=self.layer,
+            centres_m=self.centres_m,
+        )
+
+    @classmethod
+    def read(cls, path: Path) -> Blocks:
+        """What `write` wrote."""
+        with np.load(path) as stored:
+            return cls(
+                stored["of_voxel"].astype(np.int64),
+                stored["column"],
+                stored["layer"],
+                stored["centres_m"],
+            )
+
+    @staticmethod
+    def read_centres(path: Path) -> NDArrayFloat32:
+        """Of what `write` wrote the centres alone, which are a small part."""
+        with np.load(path) as stored:
+            centres: NDArrayFloat32 = stored["centres_m"]
+            return centres
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +129,9 @@ class RangeImage:
 
 @dataclass(frozen=True, eq=False)
 class _Watched:
-    """A tile's blocks, and how many sweeps met and saw through each: (2, M) uint16."""
+    """Centres (M, 3) of a tile's blocks, and how many sweeps met and saw through each: (2, M) uint16."""
 
-    blocks: _Blocks
+    centres_m: NDArrayFloat32
     counts: NDArrayAny
 
 
@@ -110,15 +141,18 @@ class SeenThrough:
     Tiles that were left keep their counts on disk.
 
     Args:
-        tiles: All of them put aside.
-        folder: For the counts; must exist.
+        centres_of: Centres (M, 3) of a tile's blocks, `Blocks.centres_m`; None where there is no tile.
+        folder: For the counts; must exist, and is for this one alone.
     """
 
-    def __init__(self, tiles: VoxelTiles, folder: Path) -> None:
-        self._tiles = tiles
+    def __init__(
+        self, centres_of: Callable[[TileIndex], NDArrayFloat32 | None], folder: Path
+    ) -> None:
+        self._centres_of = centres_of
         self._folder = folder
-        self._indices = set(tiles.tile_indices())
+        self._nothing: set[TileIndex] = set()
         self._recent: OrderedDict[TileIndex, _Watched] = OrderedDict()
+        self._written: dict[TileIndex, Path] = {}
 
     def look(self, image: RangeImage, gap_deg: float = 2.1) -> None:
         """Hold a whole sweep against the blocks around it.
@@ -137,39 +171,31 @@ class SeenThrough:
         )
         for x in range(low[0], high[0] + 1):
             for y in range(low[1], high[1] + 1):
-                if (x, y) not in self._indices:
-                    continue
                 tile = self._watched((x, y))
+                if tile is None:
+                    continue
                 corner = np.array([x * tile_m, y * tile_m, 0.0])
                 origin = city_SE3_lidar.translation - corner
-                centres = tile.blocks.centres_m
-                _compare(centres, origin, rotation, image.range_m, gap_rows, tile.counts)
+                _compare(tile.centres_m, origin, rotation, image.range_m, gap_rows, tile.counts)
 
-    def is_moving(self, index: TileIndex, voxels: Voxels) -> NDArrayBool:
-        """(N,) which voxels of a tile are the trail of something that moved; after `finish`."""
-        moving = np.zeros(len(voxels), dtype=bool)
-        path = self._path(index)
-        if not path.exists():
-            return moving
-        blocks = _Blocks.of(voxels, self._tiles.grid)
-        hits, through = np.load(path).astype(np.int64)
-        gone = (through >= _FEWEST_THROUGH) & (through >= _THROUGH_PER_HIT * hits)
-        gone = _with_tops(blocks, gone, hits, through)
-        moving[np.flatnonzero(~is_ground_of(voxels))] = gone[blocks.of_voxel]
-        return moving
-
-    def finish(self) -> None:
-        """Put all counts aside."""
+    def finish(self) -> dict[TileIndex, Path]:
+        """Put all counts aside; gives the file of each tile looked at, for `is_moving`."""
         while self._recent:
             self._leave_oldest()
+        return dict(sorted(self._written.items()))
 
-    def _watched(self, index: TileIndex) -> _Watched:
+    def _watched(self, index: TileIndex) -> _Watched | None:
+        if index in self._nothing:
+            return None
         found = self._recent.pop(index, None)
         if found is None:
-            blocks = _Blocks.of(self._tiles.voxels(index), self._tiles.grid)
-            path = self._path(index)
-            counts = np.zeros((2, len(blocks.layer)), dtype=np.uint16)
-            found = _Watched(blocks, np.load(path) if path.exists() else counts)
+            centres_m = self._centres_of(index)
+            if centres_m is None:
+                self._nothing.add(index)
+                return None
+            path = self._written.get(index)
+            counts = np.zeros((2, len(centres_m)), dtype=np.uint16)
+            found = _Watched(centres_m, counts if path is None else np.load(path))
         self._recent[index] = found
         while len(self._recent) > _TILES_IN_MEMORY:
             self._leave_oldest()
@@ -177,14 +203,33 @@ class SeenThrough:
 
     def _leave_oldest(self) -> None:
         index, tile = self._recent.popitem(last=False)
-        np.save(self._path(index), tile.counts)
+        path = self._written[index] = self._folder / f"{index[0]}_{index[1]}.npy"
+        np.save(path, tile.counts)
 
-    def _path(self, index: TileIndex) -> Path:
-        return self._folder / f"seen_{index[0]}_{index[1]}.npy"
+
+def is_moving(voxels: Voxels, blocks: Blocks, counted: Iterable[Path]) -> NDArrayBool:
+    """(N,) which voxels of a tile are the trail of something that moved.
+
+    Args:
+        voxels: Of the tile.
+        blocks: Of those voxels.
+        counted: The tile's files from all that looked, `SeenThrough.finish`; their order and
+            how many they are does not matter.
+    """
+    moving = np.zeros(len(voxels), dtype=bool)
+    counts = np.zeros((2, len(blocks.layer)), dtype=np.int64)
+    for path in counted:
+        counts += np.load(path)
+    # One that looked at all of it would have counted no further.
+    hits, through = np.minimum(counts, _MOST)
+    gone = (through >= _FEWEST_THROUGH) & (through >= _THROUGH_PER_HIT * hits)
+    gone = _with_tops(blocks, gone, hits, through)
+    moving[np.flatnonzero(~is_ground_of(voxels))] = gone[blocks.of_voxel]
+    return moving
 
 
 def _with_tops(
-    blocks: _Blocks, gone: NDArrayBool, hits: NDArrayInt, through: NDArrayInt
+    blocks: Blocks, gone: NDArrayBool, hits: NDArrayInt, through: NDArrayInt
 ) -> NDArrayBool:
     """Blocks (M,) that are gone, and those upon and under them that no ray could tell.
 

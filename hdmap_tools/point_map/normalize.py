@@ -93,6 +93,15 @@ class IntensityStatistics:
         at, number = np.unique(flat, return_counts=True)
         self.counts.reshape(-1)[at] += number
 
+    def found(self) -> tuple[NDArrayInt, NDArrayInt]:
+        """What was counted: places in the histograms, and how often each; for `add_found`."""
+        at = np.flatnonzero(self.counts)
+        return at, self.counts.reshape(-1)[at]
+
+    def add_found(self, at: NDArrayInt, number: NDArrayInt) -> None:
+        """Add what others counted."""
+        self.counts.reshape(-1)[at] += number
+
     def response(self) -> IntensityResponse | None:
         """The response that explains them; None when too little ground was seen."""
         number = self.counts.sum(axis=1)

@@ -192,13 +192,21 @@ class PointMap:
         Raises:
             PointMapError: If there is no point at all.
         """
-        for name in ("tiles", "cells", "poses"):
-            (path / name).mkdir(parents=True, exist_ok=True)
-        written = []
-        for index, tile in tiles:
-            if len(tile) == 0:
-                continue
-            written.append(_write_tile(path, index, tile))
+        path.mkdir(parents=True, exist_ok=True)
+        written = (write_tile(path, index, tile) for index, tile in tiles)
+        return cls.created(path, meta, written, trajectories)
+
+    @classmethod
+    def created(
+        cls,
+        path: Path,
+        meta: PointMapMeta,
+        tiles: Iterable[TileOfPoints | None],
+        trajectories: Mapping[str, Trajectory] | None = None,
+    ) -> PointMap:
+        """As `create`, of tiles that lie in the folder: each as `write_tile` says it."""
+        (path / "poses").mkdir(exist_ok=True)
+        written = [tile for tile in tiles if tile is not None]
         if not written:
             raise PointMapError(
                 f"No points for the point map at {path}: expected lidar returns on a ground."
@@ -433,20 +441,27 @@ def _tile_name(index: TileIndex) -> str:
     return f"{index[0]}_{index[1]}.feather"
 
 
-def _write_tile(path: Path, index: TileIndex, tile: PointTile) -> TileOfPoints:
+def write_tile(path: Path, index: TileIndex, tile: PointTile) -> TileOfPoints | None:
+    """Write one tile into a folder.
+
+    Returns:
+        What the map is to say of it; None if it is empty, which is not written.
+    """
+    if len(tile) == 0:
+        return None
     x, y, z = tile.points_mm.T
     columns = (x, y, z, tile.intensity, tile.hits, tile.is_ground, tile.cell)
-    name = _tile_name(index)
     points = dict(zip(_POINT_COLUMNS, columns, strict=True))
-    points_crc32 = write_table(path / "tiles" / name, points)
     cells = (tile.ground_cells, tile.ground_height_mm, tile.roughness_mm, tile.ground_points)
     ground = dict(zip(_CELL_COLUMNS, cells, strict=True))
+    for name in ("tiles", "cells"):
+        (path / name).mkdir(exist_ok=True)
     return TileOfPoints(
         x=index[0],
         y=index[1],
         num_points=len(tile),
-        points_crc32=points_crc32,
-        cells_crc32=write_table(path / "cells" / name, ground),
+        points_crc32=write_table(path / "tiles" / _tile_name(index), points),
+        cells_crc32=write_table(path / "cells" / _tile_name(index), ground),
     )
 
 

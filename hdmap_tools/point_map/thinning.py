@@ -1,11 +1,12 @@
 """Thin returns to one point a voxel, tile by tile, in bounded memory.
 
-All sums are whole numbers, so the result depends neither on the order of sweeps nor
-on when a tile was put aside on disk.
+All sums are whole numbers that do not overflow, so the result depends neither on the order
+of sweeps, nor on when a tile was put aside on disk, nor on who added up which of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,12 @@ class VoxelGrid:
 
     voxel_mm: int
     cell_mm: int
+
+    @property
+    def most_hits(self) -> int:
+        """Returns that the sums of one voxel hold in 32 bits, wherever they lie in it."""
+        largest = max(self.voxel_mm - 1, np.iinfo(np.uint8).max)
+        return int(np.iinfo(np.int32).max) // (_WEIGHT_AT_ONCE * largest)
 
     def indices(self, key: NDArrayInt) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt]:
         """Column, row and layer of voxels (N,); the layer counts from city height 0."""
@@ -144,7 +151,7 @@ class VoxelTiles:
 
     Args:
         grid: Size of voxels and cells.
-        folder: For the tiles put aside; must exist.
+        folder: For the tiles put aside; must exist, and is for this one alone.
     """
 
     def __init__(self, grid: VoxelGrid, folder: Path) -> None:
@@ -167,20 +174,11 @@ class VoxelTiles:
 
     def add_returns(self, returns: VoxelReturns) -> None:
         """Add returns that know their voxels."""
+        most_at_once = self.grid.most_hits // 4
         for k, index in enumerate(returns.tiles):
-            part = slice(int(returns.starts[k]), int(returns.starts[k + 1]))
-            table = self._tables.setdefault(index, _Table())
-            table.make_room(part.stop - part.start)
-            table.used = int(
-                _add_returns(
-                    returns.key[part],
-                    returns.packed[part],
-                    table.slots,
-                    table.key,
-                    table.sums,
-                    table.used,
-                )
-            )
+            first, last = int(returns.starts[k]), int(returns.starts[k + 1])
+            for start in range(first, last, most_at_once):
+                self._add(index, returns, slice(start, min(start + most_at_once, last)))
 
     def put_aside(self, xy_city: NDArrayFloat, reach_m: float) -> None:
         """Write tiles to disk that lie further than reach_m from a position (2,), metres."""
@@ -190,8 +188,11 @@ class VoxelTiles:
             if np.abs(centre - xy_city[:2]).max() > reach_m + tile_m:
                 self._write_aside(index)
 
-    def finish(self) -> None:
-        """Put all tiles aside: from now on they are read from disk.
+    def finish(self) -> dict[TileIndex, tuple[Path, ...]]:
+        """Put all tiles aside.
+
+        Returns:
+            For each tile with returns its files, for `read_voxels`.
 
         Raises:
             OSError: If any could not be written.
@@ -201,25 +202,58 @@ class VoxelTiles:
         for written in self._writing:
             written.result()
         self._writer.shutdown()
+        return {index: tuple(paths) for index, paths in sorted(self._aside.items())}
 
-    def tile_indices(self) -> tuple[TileIndex, ...]:
-        """All tiles with returns, in order."""
-        return tuple(sorted({*self._tables, *self._aside}))
+    def close(self) -> None:
+        """Leave off without finishing."""
+        self._writer.shutdown(cancel_futures=True)
 
-    def voxels(self, index: TileIndex) -> Voxels:
-        """Sums of a tile, after `finish`."""
-        parts = []
-        for path in self._aside.get(index, ()):
-            with np.load(path) as stored:
-                parts.append(Voxels(stored["key"], stored["sums"].astype(np.int64)))
-        return parts[0] if len(parts) == 1 else Voxels.joined(parts)
+    def _add(self, index: TileIndex, returns: VoxelReturns, part: slice) -> None:
+        table = self._tables.get(index)
+        if table is not None and table.most_hits + part.stop - part.start > self.grid.most_hits:
+            # A vehicle that stands for long: another return, and the sums might not fit.
+            self._write_aside(index)
+            table = None
+        if table is None:
+            table = self._tables[index] = _Table()
+        table.make_room(part.stop - part.start)
+        table.used, most_hits = _add_returns(
+            returns.key[part],
+            returns.packed[part],
+            table.slots,
+            table.key,
+            table.sums,
+            table.used,
+        )
+        table.most_hits = max(table.most_hits, most_hits)
 
     def _write_aside(self, index: TileIndex) -> None:
         table = self._tables.pop(index)
         paths = self._aside.setdefault(index, [])
-        path = self._folder / f"{index[0]}_{index[1]}_{len(paths)}.npz"
+        path = self._folder / f"{index[0]}_{index[1]}_{len(paths)}.npy"
         paths.append(path)
         self._writing.append(self._writer.submit(table.write, path))
+
+
+def read_voxels(paths: Iterable[Path]) -> Voxels:
+    """Sums of a tile from all files that hold some."""
+    parts = []
+    for path in paths:
+        rows = np.load(path)
+        parts.append(Voxels(rows["key"].copy(), rows["sums"].astype(np.int64)))
+    return parts[0] if len(parts) == 1 else Voxels.joined(parts)
+
+
+def write_voxels(path: Path, voxels: Voxels) -> None:
+    """Keep sums of a tile in a file."""
+    fits = len(voxels) == 0 or voxels.sums.max() <= np.iinfo(np.int32).max
+    _write_rows(path, voxels.key, voxels.sums.astype(np.int32 if fits else np.int64))
+
+
+def _write_rows(path: Path, key: NDArrayInt, sums: NDArrayAny) -> None:
+    rows = np.empty(len(key), dtype=[("key", np.int64), ("sums", sums.dtype, _SUMS)])
+    rows["key"], rows["sums"] = key, sums
+    np.save(path, rows)
 
 
 class _Table:
@@ -233,6 +267,7 @@ class _Table:
         self.key = np.empty(_FIRST_SLOTS // 2, dtype=np.int64)
         self.sums = np.zeros((_FIRST_SLOTS // 2, _SUMS), dtype=np.int32)
         self.used = 0
+        self.most_hits = 0
 
     def make_room(self, more: int) -> None:
         size = len(self.slots)
@@ -249,7 +284,7 @@ class _Table:
     def write(self, path: Path) -> None:
         """Keep the voxels in a file, sorted."""
         order = np.argsort(self.key[: self.used])
-        np.savez(path, key=self.key[order], sums=self.sums[order])
+        _write_rows(path, self.key[order], self.sums[order])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -343,9 +378,14 @@ def _add_returns(
     key: NDArrayInt,
     sums: NDArrayAny,
     used: int,
-) -> int:
-    """Add returns to the sums of their voxels; gives how many voxels there are then."""
+) -> tuple[int, int]:
+    """Add returns to the sums of their voxels.
+
+    Returns:
+        How many voxels there are then, and the most hits of those that were added to.
+    """
     mask = len(slots) - 1
+    most_hits = np.int32(0)
     for i in range(len(wanted)):
         own = wanted[i]
         at = _hash(own) & mask
@@ -365,4 +405,5 @@ def _add_returns(
         sums[row, 4] += w * np.int32(rest >> 8 & 255)
         sums[row, 5] += np.int32(1)
         sums[row, 6] += np.int32(rest >> 7 & 1)
-    return used
+        most_hits = max(most_hits, sums[row, 5])
+    return used, int(most_hits)

@@ -65,9 +65,9 @@ def test_an_error_of_a_worker_is_told_as_if_it_were_ours(street, hdmap, fails):
 
 
 def test_a_scheduler_that_is_not_there(street, fails, monkeypatch):
-    from hdmap_tools.distributed import build
+    from hdmap_tools.distributed import cluster
 
-    monkeypatch.setattr(build, "_ANSWERS_WITHIN_S", 1.0)
+    monkeypatch.setattr(cluster, "_ANSWERS_WITHIN_S", 1.0)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"

@@ -9,8 +9,9 @@ from hdmap_tools.config import PointsConfig
 from hdmap_tools.errors import CRSMismatchError, PointMapError
 from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.geometry.se3 import SE3
-from hdmap_tools.point_map.build import PosedDrive, build_point_map
+from hdmap_tools.point_map.build import build_point_map
 from hdmap_tools.point_map.moving import estimate_lidar_position
+from hdmap_tools.point_map.posed_drive import PosedDrive
 from hdmap_tools.readers.drive import Drive, Sweep
 
 from .scenes import LIDAR_EGO, Scene, drive_through
