@@ -41,9 +41,11 @@ def polar_cells(
         distance = np.sqrt(x * x + y * y)
         if not min_range_m < distance < max_range_m:
             continue
-        azimuth = np.arctan2(y, x)
-        sector = int(np.floor((azimuth + np.pi) / (2 * np.pi) * num_sectors)) % num_sectors
-        cell[i] = sector * num_rings + int(np.floor(distance / ring_m))
+        # Not negative, so that int() is the floor; a remainder takes as long as the angle.
+        sector = int((np.arctan2(y, x) + np.pi) / (2 * np.pi) * num_sectors)
+        if sector >= num_sectors:
+            sector -= num_sectors
+        cell[i] = sector * num_rings + int(distance / ring_m)
     return cell
 
 
@@ -74,6 +76,32 @@ def mean_samples(points: NDArrayFloat, cell: NDArrayInt, ceiling_m: NDArrayFloat
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _smallest(values: NDArrayFloat, first: int, last: int, wanted: int) -> float:
+    """What would stand at a place if values from first to last were sorted; reorders them.
+
+    Source:
+        C. A. R. Hoare, Algorithm 65: Find, Communications of the ACM 4, 1961.
+    """
+    while first < last:
+        pivot = values[wanted]
+        i, j = first, last
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < wanted:
+            first = i
+        if wanted < i:
+            last = j
+    return values[wanted]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def low_heights(cell: NDArrayInt, heights: NDArrayFloat, num_cells: int) -> NDArrayFloat:
     """A low height of each cell: the 10th percentile, robust to single returns from below.
 
@@ -101,8 +129,7 @@ def low_heights(cell: NDArrayInt, heights: NDArrayFloat, num_cells: int) -> NDAr
     for k in range(num_cells):
         count = starts[k + 1] - starts[k]
         if count > 0:
-            part = by_cell[starts[k] : starts[k + 1]]
-            low[k] = np.partition(part, count // 10)[count // 10]
+            low[k] = _smallest(by_cell, starts[k], starts[k + 1] - 1, starts[k] + count // 10)
     return low
 
 

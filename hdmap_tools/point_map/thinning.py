@@ -27,8 +27,12 @@ comes from further away counts for less than half."""
 _FIRST_SLOTS: Final = 1 << 17
 _Z_BIAS: Final = 1 << 23
 
-_MAX_TILES: Final = 1 << 16
-"""More tiles than that around some returns are sorted by comparing."""
+_BLOCKS: Final = 16
+"""Blocks a side of a tile: returns are added block by block, while its sums are in the cache."""
+_IN_GROUP: Final = 3 << 24 | 3
+"""Bits of a key that tell voxels of a group apart: of the column and of the layer."""
+_MAX_BLOCKS: Final = 1 << 18
+"""More blocks than that around some returns are sorted by comparing."""
 
 _SUMS: Final = 7
 """Weight, weighted x, y, z offsets in the voxel (mm), weighted intensity, hits, ground hits."""
@@ -108,7 +112,7 @@ def is_ground_of(voxels: Voxels) -> NDArrayBool:
 
 @dataclass(frozen=True, eq=False)
 class VoxelReturns:
-    """Returns that know their voxels, sorted by tile; made in any thread.
+    """Returns that know their voxels, sorted by tile and place; made in any thread.
 
     Attributes:
         tiles: (T,) indices.
@@ -132,14 +136,17 @@ class VoxelReturns:
         grid: VoxelGrid,
     ) -> VoxelReturns:
         """From returns (N, 3), city metres, and their distance from the vehicle."""
-        tile, local_mm, low, shape = _in_tiles(points_city)
-        if shape[0] * shape[1] <= _MAX_TILES:
-            order, _, starts = counting_sort(tile, shape[0] * shape[1])
+        block, local_mm, low, shape = _in_tiles(points_city)
+        num_blocks = shape[0] * shape[1] * _BLOCKS**2
+        if num_blocks <= _MAX_BLOCKS:
+            order, blocks, starts = counting_sort(block, num_blocks)
         else:
-            order = np.argsort(tile, kind="stable")
-            starts = np.flatnonzero(np.diff(tile[order], prepend=-1))
+            order = np.argsort(block, kind="stable")
+            blocks, starts = np.unique(block[order], return_index=True)
             starts = np.append(starts, len(order))
-        found = np.column_stack(np.divmod(tile[order[starts[:-1]]], shape[1])) + low
+        tile = blocks // _BLOCKS**2
+        edges = np.append(np.flatnonzero(np.diff(tile, prepend=-1)), len(tile))
+        found, starts = np.column_stack(np.divmod(tile[edges[:-1]], shape[1])) + low, starts[edges]
         key, packed = _packed(
             order, local_mm, intensity, is_ground, range_m, grid.voxel_mm, grid.cell_mm
         )
@@ -291,10 +298,10 @@ class _Table:
 def _in_tiles(
     points_city: NDArrayFloat,
 ) -> tuple[NDArrayInt, NDArrayInt, NDArrayInt, tuple[int, int]]:
-    """Which tile each return lies in.
+    """Which tile each return lies in, and which block of it.
 
     Returns:
-        Number (N,) of the tile, ``column * rows + row`` of those around all returns; whole
+        Number (N,) of the block, by tile, ``column * rows + row`` of those around all returns; whole
         millimetres (N, 3) from its corner; index (2,) of the first; columns and rows.
     """
     count = len(points_city)
@@ -315,7 +322,9 @@ def _in_tiles(
     columns, rows = high[0] - low[0] + 1, high[1] - low[1] + 1
     number = np.empty(count, dtype=np.int64)
     for i in range(count):
-        number[i] = (tiles[i, 0] - low[0]) * rows + tiles[i, 1] - low[1]
+        tile = (tiles[i, 0] - low[0]) * rows + tiles[i, 1] - low[1]
+        block = (local[i, 1] * _BLOCKS // TILE_MM) * _BLOCKS + local[i, 0] * _BLOCKS // TILE_MM
+        number[i] = tile * _BLOCKS * _BLOCKS + block
     return number, local, low, (columns, rows)
 
 
@@ -355,8 +364,13 @@ def _packed(
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _hash(key: int) -> int:
-    """Fibonacci hashing; the shifts bring the high bits, which hold the cell, down."""
-    return (key ^ (key >> 29)) * 0x9E3779B97F4A7C1 >> 20
+    """Fibonacci hashing of groups of 4 by 4 voxels, which stay beside each other.
+
+    The shifts bring the high bits, which hold the cell, down.
+    """
+    group = key & ~_IN_GROUP
+    group = (group ^ (group >> 29)) * 0x9E3779B97F4A7C1 >> 20
+    return group << 4 | (key >> 22 & 12) | (key & 3)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
