@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hdmap_tools.building import settings_of
 from hdmap_tools.config import AssociationConfig, Config
 from hdmap_tools.errors import MapMismatchError
 from hdmap_tools.frame_source import FrameCounts, FrameSource
@@ -22,7 +23,6 @@ from hdmap_tools.point_map.for_drive import with_points
 from hdmap_tools.readers.drive import ImageRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
-from hdmap_tools.single_steps import settings_of
 from hdmap_tools.steps import Steps
 
 _LOG = logging.getLogger(__name__)

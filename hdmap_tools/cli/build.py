@@ -68,7 +68,7 @@ def command(ctx: click.Context, /, **given: Any) -> None:
     again, and ends with the same map. The map is a versioned repository of counts; read it with `hdmap vectorize`,
     `hdmap compare` and `hdmap info`, add maps with `hdmap merge`.
     """
-    from hdmap_tools.single_steps import build_alone
+    from hdmap_tools.building import build_alone
     from hdmap_tools.steps import Steps
 
     config = options.resolve_config(given, association__also=[], export__formats=[])

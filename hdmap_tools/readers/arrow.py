@@ -18,11 +18,11 @@ def values_of(column: Any) -> NDArrayAny:
     import pyarrow as pa
 
     if column.null_count == 0:
-        chunks = [chunk for chunk in column.chunks if len(chunk)]
+        chunks = [chunk for chunk in column.chunks if len(chunk)] or [pa.nulls(0, column.type)]
         if pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
-            return _joined([np.from_dlpack(chunk) for chunk in chunks], column)
+            return _joined([np.from_dlpack(chunk) for chunk in chunks])
         if pa.types.is_boolean(column.type):
-            return _joined([_bits_of(chunk) for chunk in chunks], column)
+            return _joined([_bits_of(chunk) for chunk in chunks])
         if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
             return np.array(column.to_pylist(), dtype=object)
     return np.asarray(column.to_numpy())
@@ -34,7 +34,5 @@ def _bits_of(chunk: Any) -> NDArrayAny:
     return bits[chunk.offset :].astype(bool)
 
 
-def _joined(parts: list[NDArrayAny], column: Any) -> NDArrayAny:
-    if len(parts) == 1:
-        return parts[0]
-    return np.concatenate(parts) if parts else np.asarray(column.to_numpy())
+def _joined(parts: list[NDArrayAny]) -> NDArrayAny:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)

@@ -13,11 +13,11 @@ from .conftest import LABELS
 # Waits where the drive is fused: by then the temporary folder is there.
 WAITING = """
 import sys, time
-import hdmap_tools.pipeline, hdmap_tools.single_steps
+import hdmap_tools.pipeline, hdmap_tools.building
 def wait(*_, **__):
     print("fusing", flush=True)
     time.sleep(60)
-hdmap_tools.pipeline.build_map = hdmap_tools.single_steps.build_map = wait
+hdmap_tools.pipeline.build_map = hdmap_tools.building.build_map = wait
 from hdmap_tools.cli.main import main
 main(sys.argv[1:])
 """

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from hdmap_tools.building import build_alone
 from hdmap_tools.compare.paper import PaperScores, paper_scores
 from hdmap_tools.compare.truth_reference import true_shares
 from hdmap_tools.config import Config, ObservationConfig, load_config
@@ -32,7 +33,6 @@ from hdmap_tools.simulate.read_world import read_world, shipped_world
 from hdmap_tools.simulate.sensor_rigs import lidar_of
 from hdmap_tools.simulate.settings import Difficulty, LidarPreset, SimulationSettings
 from hdmap_tools.simulate.truth_raster import TruthRaster
-from hdmap_tools.single_steps import build_alone
 
 NAMES = [str(c) for c in MAP_CLASSES]
 CELL_M = 0.1
