@@ -25,6 +25,8 @@ from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.labels.label_set import Label, LabelSet
 from hdmap_tools.point_map.values import MapPoints
 
+from .machine import projection_ns, read_gb_s
+
 LABELS = LabelSet(
     name="five",
     labels=tuple(Label(id=k, name=f"label {k}", color=(50 * k, 0, 0)) for k in range(5)),
@@ -37,6 +39,8 @@ CAMERA = PinholeCamera(
 POSE = SE3.from_yaw(0.3, (7.0, -3.0, 0.0))
 AHEAD_M, ACROSS_M = 15.0, 10.0
 NUM_IN_CLIP = 1_000_000
+BYTES_A_POINT = 7
+"""Three positions of 16 bits, and the bin."""
 BOX_CELLS = 256
 
 
@@ -116,7 +120,14 @@ def test_a_million_points_in_the_clip() -> None:
     small = np.random.default_rng(2).integers(0, 5, (30, 48)).astype(np.uint8)
     labels = np.kron(small, np.ones((20, 20), np.uint8))
     plain = np.zeros(BOX_CELLS**2 * 5, dtype=np.int64)
-    figures = {"points in the clip": NUM_IN_CLIP}
+    figures = {
+        "points in the clip": NUM_IN_CLIP,
+        "machine": {
+            "reads_gb_s": round(read_gb_s(), 1),
+            "ns_to_read_a_point": round(BYTES_A_POINT / read_gb_s(), 2),
+            "ns_to_project_a_point": round(projection_ns(), 2),
+        },
+    }
     for occlusion in (False, True):
         config = AssociationConfig(occlusion_test=occlusion, min_range_m=0.0)
         engine, counts = DenseFusion(place, META, config), CellCounts(META)  # type: ignore[arg-type]
