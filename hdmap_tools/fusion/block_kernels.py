@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from hdmap_tools.association.visibility import CELL_PX
-from hdmap_tools.fusion.vote_kernels import SLOTS_DIFFER, scratch_for, vote_cells
+from hdmap_tools.fusion.vote_kernels import scratch_for, vote_cells
 from hdmap_tools.types import NDArrayAny, NDArrayFloat, NDArrayFloat32, NDArrayInt
 
 _ZERO: Final = np.float32(0.0)
@@ -215,7 +215,6 @@ def fuse_block(
     hide_cell = np.empty(room, dtype=np.int32)
     depth = np.empty(room, dtype=np.float32)
     slots = np.empty(room, dtype=np.uint16)
-    alike = np.empty(room, dtype=np.uint16)
     tested = len(hides_from_m) > 0
     seen = 0
     for r in range(len(runs)):
@@ -239,18 +238,12 @@ def fuse_block(
                 for i in range(len(xs)):
                     if depth[i] > hides_from_m[np.uint32(hide_cell[i])]:
                         slots[i] = np.uint16(0)
-            for k in range(k0, k1):
-                begin, end = starts[k] - first, starts[k + 1] - first
-                slot, differing = slots[begin], np.uint16(0)
-                for i in range(begin, end):
-                    differing = np.uint16(differing | (slots[i] ^ slot))
-                alike[k - k0] = SLOTS_DIFFER if differing else slot
             seen += vote_cells(
                 k0,
                 k1,
                 starts,
                 cells,
-                (slots, alike, first),
+                (slots, first),
                 rule,
                 place,
                 layers,

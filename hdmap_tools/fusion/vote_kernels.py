@@ -34,8 +34,7 @@ _31: Final = np.uint64(31)
 _CROWDED: Final = 16
 """So many points in a cell are worth passing over again and again."""
 
-SLOTS_DIFFER: Final = np.uint16(65535)
-"""In place of the slot that all points of a cell have, where they do not."""
+_NO_SLOT: Final = np.uint16(65535)
 
 _MAX_TILES: Final = 64
 """More tiles than that at once are sorted by comparing: counts would take 16 MB and more."""
@@ -126,26 +125,10 @@ def vote(
         sums: as of `vote_cells`.
     """
     scratch = scratch_for(len(layers[0]))
-    alike = np.empty(len(cells), dtype=np.uint16)
     for r in range(len(runs)):
-        for k in range(runs[r, 0], runs[r, 1]):
-            differing, first = np.uint16(0), slots[starts[k]]
-            for i in range(starts[k], starts[k + 1]):
-                differing = np.uint16(differing | (slots[i] ^ first))
-            alike[k] = SLOTS_DIFFER if differing else first
-        found = (slots, alike[runs[r, 0] :], 0)
+        first, last = runs[r, 0], runs[r, 1]
         vote_cells(
-            runs[r, 0],
-            runs[r, 1],
-            starts,
-            cells,
-            found,
-            rule,
-            place,
-            layers,
-            values,
-            sums,
-            scratch,
+            first, last, starts, cells, (slots, 0), rule, place, layers, values, sums, scratch
         )
 
 
@@ -155,7 +138,7 @@ def vote_cells(
     last_cell: int,
     starts: NDArrayInt,
     cells: NDArrayInt,
-    found: tuple[NDArrayAny, NDArrayAny, int],
+    found: tuple[NDArrayAny, int],
     rule: tuple[int, int, np.uint64],
     place: tuple[int, int, int],
     layers: tuple[NDArrayAny, ...],
@@ -170,9 +153,8 @@ def vote_cells(
         last_cell: the half-open range.
         starts: (K + 1,) first point of each cell.
         cells: (K,) flat cell in the tile, ``y * side + x``.
-        found: Slots (M,) uint16, ``1 + label * num_bins + bin``, of points by cell, 0 not seen; the
-            slot (L,) that all points of a cell have or `SLOTS_DIFFER`, from the first cell on; and
-            the point that the first of the slots is of.
+        found: Slots (M,) uint16, ``1 + label * num_bins + bin``, of points by cell, 0 not seen; and the
+            point that the first of them is of.
         rule: Bins of a label; one of `MODES`; what names the frame, to break ties.
         place: Lattice cell (ix, iy) of the tile's first, and cells a side of the tile.
         layers: Changed: counts (channels, side * side); number, sum and sum of squares of
@@ -186,7 +168,7 @@ def vote_cells(
     height_mm, intensity, has_intensity = values
     height_sums, square_sums, intensity_sums = sums
     counts, height_n, height_sum, height_sum_sq, intensity_n, intensity_sum = layers
-    slots, alike, base = found
+    slots, base = found
     points, touched, chance, quanta, remainder = scratch
     has_sums, all_measured = len(height_sums) > 0, len(has_intensity) == 0
     in_all = np.int64(0)
@@ -197,22 +179,25 @@ def vote_cells(
             continue
         here = slots[first - base : last - base]
         num, seen = 0, np.int64(0)
-        same = alike[k - first_cell]
-        if same != SLOTS_DIFFER:
+        # Most cells lie within one thing: a loop without a branch says so.
+        same, differing = here[0], 0
+        for i in range(count):
+            differing += here[i] != same
+        if differing == 0:
             if same > 0:
                 touched[0], points[same - 1] = np.int64(same) - 1, count
                 num, seen = 1, np.int64(count)
-        elif _CROWDED <= count < SLOTS_DIFFER:
+        elif _CROWDED <= count < _NO_SLOT:
             # One pass for each thing in it, 16 bits wide: faster than a tally, whose next count
             # must wait for the last.
-            slot = SLOTS_DIFFER
+            slot = _NO_SLOT
             for i in range(count):
                 slot = min(slot, here[i])
-            while slot != SLOTS_DIFFER:
-                total, following = np.uint16(0), SLOTS_DIFFER
+            while slot != _NO_SLOT:
+                total, following = np.uint16(0), _NO_SLOT
                 for i in range(count):
                     total = np.uint16(total + np.uint16(here[i] == slot))
-                    following = min(following, here[i] if here[i] > slot else SLOTS_DIFFER)
+                    following = min(following, here[i] if here[i] > slot else _NO_SLOT)
                 if slot > 0:
                     touched[num], points[np.int64(slot) - 1] = np.int64(slot) - 1, np.int64(total)
                     num += 1
