@@ -20,7 +20,9 @@ _ENOUGH_WEIGHT: Final = 12.0
 """Returns near the vehicle that make a height good to a few millimetres."""
 _LEVEL_MM: Final = 60.0
 """Ground further above or below than this is another level: a kerb is 80 to 150 mm high."""
-_BIN_MM: Final = 150
+_BIN_MM: Final = 75
+"""As the first reach, at which most points stop looking: of those in the nine bins around
+a point a third are within it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,77 +57,125 @@ def smooth_ground(
     if len(points_mm) == 0:
         none, no_cell = np.zeros(0), np.zeros(0, np.int64)
         return SmoothGround(none, no_cell, none, none, no_cell)
-    low = np.floor(points_mm[:, :2].min(axis=0) / _BIN_MM).astype(np.int64)
-    bins = np.floor(points_mm[:, :2] / _BIN_MM).astype(np.int64) - low
-    columns, rows = (bins.max(axis=0) + 1).tolist()
-    of_bin = bins[:, 1] * columns + bins[:, 0]
-    order = np.argsort(of_bin, kind="stable")
-    starts = np.searchsorted(of_bin[order], np.arange(rows * columns + 1))
-    height, residual = np.empty(len(order)), np.empty(len(order))
-    ordered = points_mm[order]
-    height[order], residual[order] = _on_local_planes(
-        ordered, weight[order], bins[order], starts, rows, columns, np.array(_REACHES_MM)
-    )
-    number = np.bincount(cell, minlength=num_cells)
-    total = np.maximum(np.bincount(cell, weight, num_cells), 1e-9)
-    mean = np.bincount(cell, weight * height, num_cells) / total
-    scatter = np.sqrt(np.bincount(cell, weight * residual**2, num_cells) / total)
+    binned = _in_bins(points_mm, weight)
+    height, residual = _on_local_planes(*binned, np.array(_REACHES_MM))
+    number, mean, scatter = _by_cell(cell, weight, height, residual, num_cells)
     seen = np.flatnonzero(number)
     return SmoothGround(height, seen, mean[seen], scatter[seen], number[seen])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _in_bins(
+    points: NDArrayFloat, weight: NDArrayFloat
+) -> tuple[NDArrayInt, NDArrayFloat, NDArrayInt, int]:
+    """Points (N, 3), millimetres, sorted by square bins.
+
+    Returns:
+        Rows (N,) by bin; x, y, z and weight (4, N) in that order; where each bin, row by row,
+        begins (bins + 1,); and how many bins there are in a row.
+    """
+    count = len(points)
+    bins = np.empty((count, 2), dtype=np.int64)
+    low, high = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    for i in range(count):
+        for axis in range(2):
+            at = np.int64(np.floor(points[i, axis] / _BIN_MM))
+            bins[i, axis] = at
+            low[axis] = at if i == 0 else min(at, low[axis])
+            high[axis] = at if i == 0 else max(at, high[axis])
+    columns = high[0] - low[0] + 1
+    starts = np.zeros((high[1] - low[1] + 1) * columns + 1, dtype=np.int64)
+    for i in range(count):
+        starts[(bins[i, 1] - low[1]) * columns + bins[i, 0] - low[0] + 1] += 1
+    for k in range(1, len(starts)):
+        starts[k] += starts[k - 1]
+    next_of = starts.copy()
+    order, ordered = np.empty(count, dtype=np.int64), np.empty((4, count))
+    for i in range(count):
+        of_bin = (bins[i, 1] - low[1]) * columns + bins[i, 0] - low[0]
+        at = next_of[of_bin]
+        next_of[of_bin] += 1
+        order[at] = i
+        ordered[0, at], ordered[1, at] = points[i, 0], points[i, 1]
+        ordered[2, at], ordered[3, at] = points[i, 2], weight[i]
+    return order, ordered, starts, columns
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _on_local_planes(
-    points: NDArrayFloat,
-    weight: NDArrayFloat,
-    bins: NDArrayInt,
+    order: NDArrayInt,
+    ordered: NDArrayFloat,
     starts: NDArrayInt,
-    rows: int,
     columns: int,
     reaches: NDArrayFloat,
 ) -> tuple[NDArrayFloat, NDArrayFloat]:
     """Height (N,) of each point on the plane through its neighbours, and its own distance from it."""
-    count = len(points)
-    height = np.empty(count)
-    residual = np.empty(count)
-    for i in range(count):
-        x0, y0, z0 = points[i]
-        fitted = z0
-        for k in range(len(reaches)):
-            reach = reaches[k]
-            span = int(np.ceil(reach / _BIN_MM))
-            # Weighted sums about the point itself; slopes are held towards 0 by a prior
-            # that matters only where the neighbours lie nearly on a line.
-            s = sx = sy = sz = sxx = sxy = syy = sxz = syz = 0.0
-            for row in range(max(bins[i, 1] - span, 0), min(bins[i, 1] + span + 1, rows)):
-                first = starts[row * columns + max(bins[i, 0] - span, 0)]
-                last = starts[row * columns + min(bins[i, 0] + span, columns - 1) + 1]
-                for j in range(first, last):
-                    dx, dy, dz = points[j, 0] - x0, points[j, 1] - y0, points[j, 2] - z0
-                    d2 = dx * dx + dy * dy
-                    if d2 > reach * reach or abs(dz) > _LEVEL_MM:
-                        continue
-                    w = weight[j] * (1.0 - 0.5 * d2 / (reach * reach))
-                    s += w
-                    sx += w * dx
-                    sy += w * dy
-                    sz += w * dz
-                    sxx += w * dx * dx
-                    sxy += w * dx * dy
-                    syy += w * dy * dy
-                    sxz += w * dx * dz
-                    syz += w * dy * dz
-            if s <= 0.0:
-                continue
-            mx, my, mz = sx / s, sy / s, sz / s
-            prior = 0.02 * reach * reach * s
-            cxx, cyy, cxy = sxx - s * mx * mx + prior, syy - s * my * my + prior, sxy - s * mx * my
-            cxz, cyz = sxz - s * mx * mz, syz - s * my * mz
-            det = cxx * cyy - cxy * cxy
-            a, b = (cxz * cyy - cyz * cxy) / det, (cyz * cxx - cxz * cxy) / det
-            fitted = z0 + mz - a * mx - b * my
-            if s >= _ENOUGH_WEIGHT:
-                break
-        height[i] = fitted
-        residual[i] = z0 - fitted
+    count = len(order)
+    rows = (len(starts) - 1) // columns
+    x, y, z, weight = ordered[0], ordered[1], ordered[2], ordered[3]
+    height, residual = np.empty(count), np.empty(count)
+    for own in range(rows * columns):
+        own_row, own_column = own // columns, own % columns
+        for i in range(starts[own], starts[own + 1]):
+            x0, y0, z0 = x[i], y[i], z[i]
+            fitted = z0
+            for k in range(len(reaches)):
+                r2 = reaches[k] * reaches[k]
+                span = int(np.ceil(reaches[k] / _BIN_MM))
+                left, right = max(own_column - span, 0), min(own_column + span + 1, columns)
+                # Weighted sums about the point itself; slopes are held towards 0 by a prior
+                # that matters only where the neighbours lie nearly on a line.
+                s = sx = sy = sz = sxx = sxy = syy = sxz = syz = 0.0
+                for row in range(max(own_row - span, 0), min(own_row + span + 1, rows)):
+                    for j in range(starts[row * columns + left], starts[row * columns + right]):
+                        dx, dy, dz = x[j] - x0, y[j] - y0, z[j] - z0
+                        d2 = dx * dx + dy * dy
+                        if d2 > r2 or abs(dz) > _LEVEL_MM:
+                            continue
+                        w = weight[j] * (1.0 - 0.5 * d2 / r2)
+                        s += w
+                        sx += w * dx
+                        sy += w * dy
+                        sz += w * dz
+                        sxx += w * dx * dx
+                        sxy += w * dx * dy
+                        syy += w * dy * dy
+                        sxz += w * dx * dz
+                        syz += w * dy * dz
+                if s <= 0.0:
+                    continue
+                mx, my, mz = sx / s, sy / s, sz / s
+                prior = 0.02 * r2 * s
+                cxx, cyy, cxy = sxx - s * mx * mx + prior, syy - s * my * my + prior, sxy - s * mx * my
+                cxz, cyz = sxz - s * mx * mz, syz - s * my * mz
+                det = cxx * cyy - cxy * cxy
+                a, b = (cxz * cyy - cyz * cxy) / det, (cyz * cxx - cxz * cxy) / det
+                fitted = z0 + mz - a * mx - b * my
+                if s >= _ENOUGH_WEIGHT:
+                    break
+            height[order[i]] = fitted
+            residual[order[i]] = z0 - fitted
     return height, residual
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _by_cell(
+    cell: NDArrayInt,
+    weight: NDArrayFloat,
+    height: NDArrayFloat,
+    residual: NDArrayFloat,
+    num_cells: int,
+) -> tuple[NDArrayInt, NDArrayFloat, NDArrayFloat]:
+    """Of each cell (num_cells,) its points, their weighted mean height, and scatter about their planes."""
+    number = np.zeros(num_cells, dtype=np.int64)
+    total, mean, scatter = np.zeros(num_cells), np.zeros(num_cells), np.zeros(num_cells)
+    for i in range(len(cell)):
+        c, w = cell[i], weight[i]
+        number[c] += 1
+        total[c] += w
+        mean[c] += w * height[i]
+        scatter[c] += w * (residual[i] * residual[i])
+    for c in range(num_cells):
+        mean[c] /= max(total[c], 1e-9)
+        scatter[c] = np.sqrt(scatter[c] / max(total[c], 1e-9))
+    return number, mean, scatter
