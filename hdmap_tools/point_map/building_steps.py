@@ -37,7 +37,7 @@ from hdmap_tools.readers.drive import SweepRef
 from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat, NDArrayInt
 
 if TYPE_CHECKING:
-    from hdmap_tools.point_map.moving import RangeImage
+    from hdmap_tools.point_map.range_image import RangeImage
     from hdmap_tools.point_map.thinning import VoxelGrid, VoxelReturns, Voxels
 
 _ASPHALT_FROM_PATH_M: Final = 2.5
@@ -266,7 +266,8 @@ def sum_tile(site: Site, index: TileIndex, files: tuple[Path, ...]) -> None:
 
 def look_through(site: Site, run: Run, lidar: Lidar) -> Files:
     """Count what the sweeps of a run saw through, by tile."""
-    from hdmap_tools.point_map.moving import Blocks, RangeImage, SeenThrough
+    from hdmap_tools.point_map.moving import Blocks, SeenThrough
+    from hdmap_tools.point_map.range_image import RangeImage
 
     posed = site.drives[run.drive]
 
