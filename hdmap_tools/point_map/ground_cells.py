@@ -154,7 +154,11 @@ def _on_local_planes(
                 )
                 mx, my, mz = sx / s, sy / s, sz / s
                 prior = 0.02 * r2 * s
-                cxx, cyy, cxy = sxx - s * mx * mx + prior, syy - s * my * my + prior, sxy - s * mx * my
+                cxx, cyy, cxy = (
+                    sxx - s * mx * mx + prior,
+                    syy - s * my * my + prior,
+                    sxy - s * mx * my,
+                )
                 cxz, cyz = sxz - s * mx * mz, syz - s * my * mz
                 det = cxx * cyy - cxy * cxy
                 a, b = (cxz * cyy - cyz * cxy) / det, (cyz * cxx - cxz * cxy) / det

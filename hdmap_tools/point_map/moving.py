@@ -164,7 +164,13 @@ class SeenThrough:
                 corner = np.array([x * tile_m, y * tile_m, 0.0])
                 origin = city_SE3_lidar.translation - corner
                 _compare(
-                    tile.centres_m, origin, rotation, windows, image.first_row, gap_rows, tile.counts
+                    tile.centres_m,
+                    origin,
+                    rotation,
+                    windows,
+                    image.first_row,
+                    gap_rows,
+                    tile.counts,
                 )
 
     def finish(self) -> dict[TileIndex, Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -125,7 +125,8 @@ def _row_and_column(x: float, y: float, z: float) -> tuple[np.float32, np.float3
 
 
 @njit(inline="always", error_model="numpy")  # type: ignore[untyped-decorator]
-def _is_sure(row: np.float32, column: np.float32) -> bool:
+def _is_sure(row: np.float32, column: np.float32) -> Any:
+    """Whether single precision tells the bin."""
     part, other = row - np.floor(row), column - np.floor(column)
     return (part > _UNSURE) & (part < _SURE) & (other > _UNSURE) & (other < _SURE)
 
@@ -138,8 +139,8 @@ def _exact_row_and_column(x: float, y: float, z: float) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def bin_of(x: float, y: float, z: float) -> tuple[int, int]:
-    """Row and column of a direction, lidar frame; rows may be below 0 or beyond the last."""
+def bin_of(x: float, y: float, z: float) -> Any:
+    """Row and column (int, int) of a direction, lidar frame; rows may be below 0 or beyond the last."""
     row, column = _row_and_column(x, y, z)
     if _is_sure(row, column):
         return int(row), int(column)
@@ -182,7 +183,7 @@ def nearest_within(
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _directions(
     points: NDArrayFloat, lidar: NDArrayFloat
-) -> tuple[NDArrayAny, NDArrayFloat32, int, int]:
+) -> tuple[NDArrayAny, NDArrayFloat32, Any, Any]:
     """Of returns their place, ``row * COLUMNS + column`` or below 0, distance, and the range of rows."""
     count = len(points)
     place, distance_m = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.float32)
@@ -218,16 +219,16 @@ def _directions(
             place[i] = at
         if at >= 0:
             low, high = min(low, at), max(high, at)
-    return place, distance_m, low // COLUMNS, high // COLUMNS
+    return place, distance_m, np.int64(low) // COLUMNS, np.int64(high) // COLUMNS
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _filled(
-    place: NDArrayAny, distance_m: NDArrayFloat32, low: int, high: int
-) -> NDArrayFloat32:
+def _filled(place: NDArrayAny, distance_m: NDArrayFloat32, low: int, high: int) -> NDArrayFloat32:
     """The nearest at each place, of the rows from low to high, with margins."""
     rows = max(high - low + 1, 0)
-    image = np.full((rows + 2 * EMPTY_ROWS, COLUMNS + 2 * MARGIN), np.float32(np.inf), dtype=np.float32)
+    image = np.full(
+        (rows + 2 * EMPTY_ROWS, COLUMNS + 2 * MARGIN), np.float32(np.inf), dtype=np.float32
+    )
     for i in range(len(place)):
         if place[i] >= 0:
             row = place[i] // np.int32(COLUMNS)
