@@ -37,7 +37,7 @@ from hdmap_tools.readers.drive import SweepRef
 from hdmap_tools.types import NDArrayBool, NDArrayByte, NDArrayFloat, NDArrayInt
 
 if TYPE_CHECKING:
-    from hdmap_tools.point_map.moving import RangeImage
+    from hdmap_tools.point_map.range_image import RangeImage
     from hdmap_tools.point_map.thinning import VoxelGrid, VoxelReturns, Voxels
 
 _ASPHALT_FROM_PATH_M: Final = 2.5
@@ -266,7 +266,8 @@ def sum_tile(site: Site, index: TileIndex, files: tuple[Path, ...]) -> None:
 
 def look_through(site: Site, run: Run, lidar: Lidar) -> Files:
     """Count what the sweeps of a run saw through, by tile."""
-    from hdmap_tools.point_map.moving import Blocks, RangeImage, SeenThrough
+    from hdmap_tools.point_map.moving import Blocks, SeenThrough
+    from hdmap_tools.point_map.range_image import RangeImage
 
     posed = site.drives[run.drive]
 
@@ -301,34 +302,31 @@ def finish_tile(
     from hdmap_tools.point_map.thinning import read_voxels
 
     voxels = read_voxels([site.voxels_of(index)])
-    if seen:
-        voxels = voxels.keep(~is_moving(voxels, Blocks.read(site.blocks_of(index)), seen))
+    moving = is_moving(voxels, Blocks.read(site.blocks_of(index)), seen) if seen else None
     made = site.new_folder()
-    written = write_tile(made, index, made_tile(voxels, site.grid))
+    written = write_tile(made, index, made_tile(voxels, site.grid, moving))
     for path in made.glob("*/*"):
         os.replace(path, folder / path.relative_to(made))
     return written
 
 
-def made_tile(voxels: Voxels, grid: VoxelGrid) -> PointTile:
-    """The points of a tile and its ground, from the sums of its voxels."""
-    from hdmap_tools.point_map.thinning import intensity_of, is_ground_of
+def made_tile(voxels: Voxels, grid: VoxelGrid, left_out: NDArrayBool | None = None) -> PointTile:
+    """The points of a tile and its ground, from the sums of its voxels, but for those left out (N,)."""
+    from hdmap_tools.point_map.tile_kernels import thinned_points
 
-    points_mm = grid.means_mm(voxels)
-    is_ground, cell = is_ground_of(voxels), grid.cells(voxels.key)
+    if left_out is None:
+        left_out = np.zeros(len(voxels), dtype=bool)
+    points = thinned_points(voxels.key, voxels.sums, left_out, grid.voxel_mm)
     ground = smooth_ground(
-        points_mm[is_ground],
-        voxels.sums[is_ground, 0] / 64.0,
-        cell[is_ground],
-        (TILE_MM // grid.cell_mm) ** 2,
+        points.ground_mm, points.ground_weight, points.ground_cell, (TILE_MM // grid.cell_mm) ** 2
     )
-    points_mm[is_ground, 2] = ground.height_mm
+    points.columns_mm[2, points.is_ground] = np.rint(ground.height_mm)
     return PointTile(
-        np.rint(points_mm).astype(np.int32),
-        intensity_of(voxels),
-        voxels.sums[:, 5].astype(np.int32),
-        is_ground,
-        cell.astype(np.uint16),
+        points.columns_mm.T,
+        points.intensity,
+        points.hits,
+        points.is_ground,
+        points.cell,
         ground.cells.astype(np.uint16),
         np.rint(ground.cell_height_mm).astype(np.int32),
         np.rint(ground.roughness_mm).astype(np.int32),

@@ -21,8 +21,16 @@ from typing import Final
 import numpy as np
 from numba import njit
 
-from hdmap_tools.geometry.se3 import SE3
 from hdmap_tools.point_map.point_map import TILE_MM, TileIndex
+from hdmap_tools.point_map.range_image import (
+    BIN_DEG,
+    MARGIN,
+    ROWS,
+    RangeImage,
+    Windows,
+    bin_of,
+    nearest_within,
+)
 from hdmap_tools.point_map.thinning import VoxelGrid, Voxels, is_ground_of
 from hdmap_tools.readers.drive import Sweep
 from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayFloat32, NDArrayInt
@@ -30,10 +38,6 @@ from hdmap_tools.types import NDArrayAny, NDArrayBool, NDArrayFloat, NDArrayFloa
 BLOCK_MM: Final = 200
 """Voxels are judged in blocks of this edge: rays of a lidar pass 5 cm voxels by."""
 
-_BIN_DEG: Final = 0.125
-_COLUMNS: Final = int(360 / _BIN_DEG)
-_ROWS: Final = int(60 / _BIN_DEG)
-_LOWEST_DEG: Final = -40.0
 _MARGIN_M: Final = 0.3
 """A return so near to a block's own range met it: half a block's diagonal and pose errors."""
 _THROUGH_M: Final = 0.05
@@ -109,25 +113,6 @@ class Blocks:
 
 
 @dataclass(frozen=True, eq=False)
-class RangeImage:
-    """How far a sweep saw in each direction; made in any thread.
-
-    Attributes:
-        range_m: (rows, columns) float32 nearest return; infinite where nothing came back.
-        city_SE3_lidar: Where from.
-    """
-
-    range_m: NDArrayFloat32
-    city_SE3_lidar: SE3
-
-    @classmethod
-    def of(cls, sweep: Sweep, city_SE3_ego: SE3, lidar_ego: NDArrayFloat) -> RangeImage:
-        """From a whole sweep at its pose, whose rays come from (3,), ego frame, metres."""
-        image = _range_image(sweep.points_ego, lidar_ego)
-        return cls(image, city_SE3_ego @ SE3(np.eye(3), lidar_ego))
-
-
-@dataclass(frozen=True, eq=False)
 class _Watched:
     """Centres (M, 3) of a tile's blocks, and how many sweeps met and saw through each: (2, M) uint16."""
 
@@ -150,6 +135,7 @@ class SeenThrough:
     ) -> None:
         self._centres_of = centres_of
         self._folder = folder
+        self._windows = Windows()
         self._nothing: set[TileIndex] = set()
         self._recent: OrderedDict[TileIndex, _Watched] = OrderedDict()
         self._written: dict[TileIndex, Path] = {}
@@ -163,7 +149,8 @@ class SeenThrough:
         """
         city_SE3_lidar = image.city_SE3_lidar
         rotation = city_SE3_lidar.rotation
-        gap_rows = int(np.ceil(gap_deg / _BIN_DEG))
+        gap_rows = int(np.ceil(gap_deg / BIN_DEG))
+        windows = self._windows.of(image)
         tile_m = TILE_MM / 1000.0
         low, high = (
             np.floor((city_SE3_lidar.translation[:2] + step) / tile_m).astype(int).tolist()
@@ -176,7 +163,15 @@ class SeenThrough:
                     continue
                 corner = np.array([x * tile_m, y * tile_m, 0.0])
                 origin = city_SE3_lidar.translation - corner
-                _compare(tile.centres_m, origin, rotation, image.range_m, gap_rows, tile.counts)
+                _compare(
+                    tile.centres_m,
+                    origin,
+                    rotation,
+                    windows,
+                    image.first_row,
+                    gap_rows,
+                    tile.counts,
+                )
 
     def finish(self) -> dict[TileIndex, Path]:
         """Put all counts aside; gives the file of each tile looked at, for `is_moving`."""
@@ -288,31 +283,13 @@ def estimate_lidar_position(sweeps: list[Sweep]) -> NDArrayFloat:
     return np.asarray(fit.x) if ((fit.x > low) & (fit.x < high)).all() else usual
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _range_image(points: NDArrayFloat, lidar: NDArrayFloat) -> NDArrayFloat32:
-    """Nearest range by direction, (rows, columns); infinite where nothing came back."""
-    image = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)
-    for i in range(len(points)):
-        x, y, z = points[i, 0] - lidar[0], points[i, 1] - lidar[1], points[i, 2] - lidar[2]
-        distance = np.sqrt(x * x + y * y + z * z)
-        if distance < _NEAREST_M - 1.0:
-            continue
-        elevation = np.rad2deg(np.arctan2(z, np.sqrt(x * x + y * y)))
-        row = int((elevation - _LOWEST_DEG) / _BIN_DEG)
-        if row < 0 or row >= _ROWS:
-            continue
-        column = int((np.rad2deg(np.arctan2(y, x)) + 180.0) / _BIN_DEG) % _COLUMNS
-        if distance < image[row, column]:
-            image[row, column] = distance
-    return image
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _compare(
     centres: NDArrayFloat32,
     origin: NDArrayFloat,
     rotation: NDArrayFloat,
-    image: NDArrayFloat32,
+    windows: NDArrayFloat32,
+    first_row: int,
     gap_rows: int,
     counts: NDArrayAny,
 ) -> None:
@@ -330,32 +307,28 @@ def _compare(
         x = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * c
         y = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * c
         z = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * c
-        flat = np.sqrt(x * x + y * y)
-        row = int((np.rad2deg(np.arctan2(z, flat)) - _LOWEST_DEG) / _BIN_DEG)
-        column = int((np.rad2deg(np.arctan2(y, x)) + 180.0) / _BIN_DEG)
-        tall = max(int(np.rad2deg(half_m / distance) / _BIN_DEG + 0.5), 1)
-        wide = max(int(np.rad2deg(half_m / max(flat, 0.1)) / _BIN_DEG + 0.5), 1)
-        tall_through = int(np.rad2deg(_THROUGH_M / distance) / _BIN_DEG + 0.5)
-        wide_through = int(np.rad2deg(_THROUGH_M / max(flat, 0.1)) / _BIN_DEG + 0.5)
-        if row < tall or row + tall >= _ROWS:
+        row, column = bin_of(x, y, z)
+        tall = max(int(np.rad2deg(half_m / distance) / BIN_DEG + 0.5), 1)
+        if row < tall or row + tall >= ROWS:
             continue
-        nearest, through = np.inf, False
-        for r in range(row - tall, row + tall + 1):
-            for k in range(column - wide, column + wide + 1):
-                measured = image[r, k % _COLUMNS]
-                nearest = min(nearest, measured)
-                if abs(r - row) <= tall_through and abs(k - column) <= wide_through:
-                    through |= measured < np.inf
-            if nearest < distance - _MARGIN_M:
-                break
-        if nearest > distance + _MARGIN_M:
-            if not through:
-                continue
-            first = row - tall - gap_rows if z < 0.0 else row + tall + 1
-            for r in range(max(first, 0), min(first + gap_rows, _ROWS)):
-                for k in range(column - wide, column + wide + 1):
-                    nearest = min(nearest, image[r, k % _COLUMNS])
-            if nearest > distance + _MARGIN_M:
-                counts[1, i] = min(counts[1, i] + 1, 65535)
-        elif nearest >= distance - _MARGIN_M:
+        flat = max(np.sqrt(x * x + y * y), 0.1)
+        wide = max(int(np.rad2deg(half_m / flat) / BIN_DEG + 0.5), 1)
+        row -= first_row
+        column += MARGIN
+        nearest = nearest_within(windows, row - tall, row + tall, column, wide)
+        if nearest < distance - _MARGIN_M:
+            continue
+        if nearest <= distance + _MARGIN_M:
             counts[0, i] = min(counts[0, i] + 1, 65535)
+            continue
+        tall_through = int(np.rad2deg(_THROUGH_M / distance) / BIN_DEG + 0.5)
+        wide_through = int(np.rad2deg(_THROUGH_M / flat) / BIN_DEG + 0.5)
+        through = nearest_within(
+            windows, row - tall_through, row + tall_through, column, wide_through
+        )
+        if through == np.inf:
+            continue
+        first = row - tall - gap_rows if z < 0.0 else row + tall + 1
+        beside = nearest_within(windows, first, first + gap_rows - 1, column, wide)
+        if beside > distance + _MARGIN_M:
+            counts[1, i] = min(counts[1, i] + 1, 65535)
