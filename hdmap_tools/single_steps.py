@@ -17,6 +17,7 @@ from hdmap_tools.config import Config
 from hdmap_tools.distributed.build import add_segments
 from hdmap_tools.distributed.cluster import Workers, connected
 from hdmap_tools.distributed.count_segment import SegmentTask
+from hdmap_tools.distributed.vectorize import over_workers
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.frame_source import FrameCounts
@@ -34,8 +35,9 @@ from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.unfinished_map import map_when_done, require_free_for_map, resumable_map
-from hdmap_tools.vectorization import VectorizationResult, choose, vectorize
+from hdmap_tools.vectorization import VectorizationResult, choose
 from hdmap_tools.view.agreement import agreement_picture
+from hdmap_tools.windowed.vectorize_map import vectorize_map
 
 _LOG = logging.getLogger(__name__)
 
@@ -165,15 +167,41 @@ def settings_of(config: Config, meta: MapMeta) -> Config:
 
 
 def vectorize_alone(
-    map_path: MapLocation, out: Path, config: Config, *, overwrite: bool = False
+    map_path: MapLocation,
+    out: Path,
+    config: Config,
+    *,
+    overwrite: bool = False,
+    workers: Workers | None = None,
+    told: SegmentProgress | None = None,
 ) -> VectorizationResult:
-    """Vectorize a semantic map into a GeoPackage."""
+    """Vectorize a semantic map into a GeoPackage.
+
+    Args:
+        map_path: The map.
+        out: The file to make.
+        config: How the map is read and which plugins run.
+        overwrite: Replace an earlier file.
+        workers: Processes to spread a large map's windows over; None: this one does them.
+        told: After each window.
+    """
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists; use --overwrite to replace it.")
     choose(config.vectorize)  # what is wrong with the plugins asked for is said before any work
     semantic_map = SemanticMap.open(map_path)
-    window = whole_window(semantic_map, model_for(semantic_map.meta, config, semantic_map), config)
-    result = vectorize(window, config.vectorize)
+    model = model_for(semantic_map.meta, config, semantic_map)
+    with ExitStack() as stack:
+        crew = None
+        if workers is not None:
+            crew = partial(over_workers, stack.enter_context(connected(workers)))
+        result = vectorize_map(
+            semantic_map,
+            model,
+            config.vectorize,
+            fill_radius_cells=config.observation.fill_radius_cells,
+            crew=crew,
+            told=told,
+        )
     write_gpkg(result.vector_map, out, overwrite=overwrite)
     return result
 
