@@ -307,15 +307,15 @@ class VectorizeConfig(_Step):
         vectorizers: Names; empty means all installed ones.
         options: Options by plugin name.
         seed: Seed of the generator each plugin is handed.
-        window_m: A map that takes more memory than one window of this side (and what
-            plugins must see around it) is vectorized in such windows, and their elements are
-            put together again; made a whole number of tiles.
+        window_m: A map that has more cells than two windows of this side, with what plugins
+            must see around them, is vectorized in such windows, and their elements are put
+            together again. Made a whole number of tiles.
     """
 
     vectorizers: tuple[str, ...] = ()
     options: dict[str, dict[str, Any]] = Field(default_factory=dict)
     seed: int = 0
-    window_m: Annotated[float, Field(gt=0)] = 150.0
+    window_m: Annotated[float, Field(gt=0)] = 100.0
 
 
 class ExportConfig(_Step):

@@ -17,7 +17,7 @@ from hdmap_tools.cli import options
 @click.option(
     "--window",
     type=float,
-    help="Side of the windows that a large map is vectorized in, metres [default: 150].",
+    help="Side of the windows that a large map is vectorized in, metres [default: 100].",
 )
 @options.worker_options("the map", "; a map in S3 with the same environment")
 @options.overwrite_option
@@ -33,7 +33,7 @@ def command(ctx: click.Context, /, **given: Any) -> int:
       hdmap vectorize map -o marks.gpkg --vectorizer lane_mark_skeleton
       hdmap vectorize city -o city.gpkg --workers 8
 
-    A map that is larger than a window with what plugins must see around it is vectorized
+    A map that is larger than two windows with what plugins must see around them is vectorized
     window by window, and lines and areas that cross a seam are put together again.
     """
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED

@@ -112,22 +112,28 @@ def _ring_without_steps(
     ring: NDArrayFloat, seams_m: tuple[NDArrayFloat, NDArrayFloat]
 ) -> NDArrayFloat | None:
     points = ring[:-1]
-    on_seam = np.zeros(len(points), dtype=bool)
-    for axis, seams in enumerate(seams_m):
-        away = np.abs(points[:, axis, None] - seams[None])
-        on_seam |= away.min(axis=1) <= 10 * _ON_SEAM_M
-    if not on_seam.any() or on_seam.all():
+    on_seam = np.column_stack(
+        [
+            np.abs(points[:, axis, None] - seams[None]).min(axis=1) <= 10 * _ON_SEAM_M
+            for axis, seams in enumerate(seams_m)
+        ]
+    )
+    is_free = ~on_seam.any(axis=1)
+    if is_free.all() or not is_free.any():
         return ring
-    points = np.roll(points, -int(np.argmin(on_seam)), axis=0)
-    on_seam = np.roll(on_seam, -int(np.argmin(on_seam)))
+    first = int(np.argmax(is_free))
+    points, on_seam = np.roll(points, -first, axis=0), np.roll(on_seam, -first, axis=0)
+    along = np.abs(np.diff(points[:, :2], axis=0)) <= 10 * _ON_SEAM_M
+    # Whether a vertex lies on the seam of the one before: both have its x, or its y.
+    goes_on = np.append(False, (on_seam[1:] & on_seam[:-1] & along).any(axis=1))
     result: list[NDArrayFloat] = []
     k = 0
     while k < len(points):
         last = k
-        while on_seam[k] and last + 1 < len(points) and on_seam[last + 1]:
+        while last + 1 < len(points) and goes_on[last + 1]:
             last += 1
         run = points[k : last + 1]
-        if on_seam[k] and np.hypot(*(run[-1] - run[0])[:2]) <= _STEP_M:
+        if last > k and np.hypot(*(run[-1] - run[0])[:2]) <= _STEP_M:
             result.append((run[0] + run[-1]) / 2.0)
         else:
             result += list(run)

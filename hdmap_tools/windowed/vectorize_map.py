@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -129,6 +129,7 @@ def vectorize_map(
 
     if windows[0].core is None or not local:
         return run(all_of_it(), plugins, seed=config.seed, failures=failures)
+    crew = crew or partial(_in_this_process, semantic_map, local, config.seed)
     task = WindowsTask(
         semantic_map.location,
         semantic_map.history()[0].id,
@@ -138,11 +139,11 @@ def vectorize_map(
     )
     _LOG.info("Vectorizing in %d windows.", len(windows))
     found: dict[int, WindowPieces] = {}
-    for number, pieces in (crew or _in_this_process)(task, windows):
+    for number, pieces in crew(task, windows):
         found[number] = pieces
         if told is not None:
             told(len(found), len(windows))
-    runs = _joined([found[k] for k in range(len(windows))], windows, local, failures)
+    runs = joined([found[k] for k in range(len(windows))], windows, local, failures)
     if of_map:
         later = run_plugins(
             all_of_it(), of_map, seed=config.seed, failures=runs.failures, before=runs.elements
@@ -155,7 +156,7 @@ def vectorize_map(
 def vectorize_window(task: WindowsTask, window: Window) -> WindowPieces:
     """Vectorize one window; for a worker, which keeps map and plugins for the next one."""
     semantic_map, plugins, seed = _opened(task.location, task.version, task.config)
-    return _pieces_of(_read(semantic_map, task, window), window, plugins, seed)
+    return pieces_of_window(_read(semantic_map, task, window), window, plugins, seed)
 
 
 @lru_cache(maxsize=1)
@@ -168,13 +169,16 @@ def _opened(
 
 
 def _in_this_process(
-    task: WindowsTask, windows: Sequence[Window]
+    semantic_map: SemanticMap,
+    plugins: Sequence[LoadedPlugin],
+    seed: int,
+    task: WindowsTask,
+    windows: Sequence[Window],
 ) -> Iterator[tuple[int, WindowPieces]]:
-    semantic_map, plugins, seed = _opened(task.location, task.version, task.config)
     # The next window is read while one is vectorized.
     ahead = made_ahead(windows, lambda window: _read(semantic_map, task, window), number=2)
     for number, window in enumerate(windows):
-        yield number, _pieces_of(next(ahead), window, plugins, seed)
+        yield number, pieces_of_window(next(ahead), window, plugins, seed)
 
 
 def _read(semantic_map: SemanticMap, task: WindowsTask, window: Window) -> MapWindow:
@@ -182,9 +186,10 @@ def _read(semantic_map: SemanticMap, task: WindowsTask, window: Window) -> MapWi
     return read_only(read_window(semantic_map, window.grid, task.model, task.fill_radius_cells))
 
 
-def _pieces_of(
+def pieces_of_window(
     read: MapWindow, window: Window, plugins: Sequence[LoadedPlugin], seed: int
 ) -> WindowPieces:
+    """Vectorize a window that was read, and cut what was found to what it answers for."""
     runs = run_plugins(read, plugins, seed=seed)
     failures = {failure.name: failure for failure in runs.failures}
     x0, y0, x1, y1 = read.grid.bounds_m
@@ -210,13 +215,20 @@ def _pieces_of(
     )
 
 
-def _joined(
+def joined(
     found: Sequence[WindowPieces],
     windows: Sequence[Window],
     plugins: Sequence[LoadedPlugin],
     failures: Sequence[PluginFailure],
 ) -> PluginRuns:
-    """All windows' pieces as elements of the map; a plugin that failed in one window lost them all."""
+    """All windows' pieces as elements of the map; a plugin that failed in one window lost them all.
+
+    Args:
+        found: Of each window, in their order.
+        windows: These.
+        plugins: That ran in them, required ones first.
+        failures: What failed before.
+    """
     failed = {failure.name: failure for failure in failures}
     for one in found:
         for failure in one.failures:
