@@ -315,7 +315,7 @@ class VectorizeConfig(_Step):
     vectorizers: tuple[str, ...] = ()
     options: dict[str, dict[str, Any]] = Field(default_factory=dict)
     seed: int = 0
-    window_m: Annotated[float, Field(gt=0)] = 100.0
+    window_m: Annotated[float, Field(gt=0, le=10_000)] = 100.0
 
 
 class ExportConfig(_Step):

@@ -10,6 +10,7 @@ from hdmap_tools.fusion.cell_counts import TILE_CELLS, CellCounts, Tile
 from hdmap_tools.fusion.map_meta import MapMeta
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.labels.label_set import load_label_set
+from hdmap_tools.testing.fake_plugins import FakePlugins
 from hdmap_tools.windowed import vectorize_map as windowed
 
 pytest.importorskip("distributed", reason="needs the extra `distributed`")
@@ -83,6 +84,48 @@ def test_workers_make_the_same_file(street_map, hdmap, alone):
     assert code == 0, err
     assert out.partition(" in ")[0] == alone[1]
     assert (street_map / "spread.gpkg").read_bytes() == alone[0]
+
+
+def test_one_that_needs_the_whole_map_gets_it_and_the_finished_lines(
+    street_map, hdmap, tmp_path, monkeypatch
+):
+    fakes = FakePlugins(tmp_path / "plugins")
+    fakes.folder.mkdir()
+    monkeypatch.syspath_prepend(str(fakes.folder))
+    monkeypatch.setattr("importlib.metadata.entry_points", fakes.entry_points)
+    line = "LaneMark(geometry=LineString([(x0 + 1, 16, 0), (x1 - 1, 16, 0)]))"
+    fakes.add(
+        "some-dist",
+        {
+            "lines": f"def vectorize(self, window, upstream, options, *, rng):\n"
+            f"    x0, y0, x1, y1 = window.grid.bounds_m\n    return [{line}]\n",
+            "whole": "scope = 'map'\nrequires = ('lines',)\n"
+            "def vectorize(self, window, upstream, options, *, rng):\n"
+            "    x0, y0, x1, y1 = window.grid.bounds_m\n"
+            "    (line,) = upstream\n"
+            "    assert x1 - x0 > 204 and line.id and line.geometry.length > 200\n"
+            "    return [LaneMark(geometry=line.geometry, id='mine', width_m=1.0)]\n",
+        },
+    )
+    code, _, err = hdmap(*VECTORIZE, "-o", "f.gpkg")
+    assert code == 0, err
+    made = read_gpkg(street_map / "f.gpkg")
+    assert {element.plugin for element in made} == {"lines", "whole"}
+    assert "mine" in {element.id for element in made}
+    assert len(made.provenance["plugins"]) == 2
+
+
+@pytest.mark.parametrize("side", ["0", "-5", "nan", "inf"])
+def test_a_window_without_a_size(street_map, fails, side):
+    fails("vectorize", "map", "-o", "f.gpkg", "--window", side, says=("window_m",))
+
+
+def test_an_empty_map_gives_an_empty_file(street_map, hdmap):
+    meta = SemanticMap.open(street_map / "map").meta
+    SemanticMap.create(street_map / "empty", meta)
+    code, out, err = hdmap("vectorize", "empty", "-o", "f.gpkg")
+    assert code == 0, err
+    assert "No elements" in out
 
 
 @pytest.mark.slow
