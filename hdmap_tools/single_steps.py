@@ -190,18 +190,14 @@ def vectorize_alone(
     choose(config.vectorize)  # what is wrong with the plugins asked for is said before any work
     semantic_map = SemanticMap.open(map_path)
     model = model_for(semantic_map.meta, config, semantic_map)
-    with ExitStack() as stack:
-        crew = None
-        if workers is not None:
-            crew = partial(over_workers, stack.enter_context(connected(workers)))
-        result = vectorize_map(
-            semantic_map,
-            model,
-            config.vectorize,
-            fill_radius_cells=config.observation.fill_radius_cells,
-            crew=crew,
-            told=told,
-        )
+    result = vectorize_map(
+        semantic_map,
+        model,
+        config.vectorize,
+        fill_radius_cells=config.observation.fill_radius_cells,
+        crew=None if workers is None else partial(over_workers, workers),
+        told=told,
+    )
     write_gpkg(result.vector_map, out, overwrite=overwrite)
     return result
 

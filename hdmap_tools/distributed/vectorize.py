@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hdmap_tools.distributed.cluster import deaths_explained, queue_length
+from hdmap_tools.distributed.cluster import Workers, connected, deaths_explained, queue_length
 from hdmap_tools.windowed.vectorize_map import WindowPieces, WindowsTask, vectorize_window
 from hdmap_tools.windowed.windows import Window
 
@@ -19,19 +19,27 @@ if TYPE_CHECKING:
 
 
 def over_workers(
-    client: Client, task: WindowsTask, windows: Sequence[Window]
+    workers: Workers, task: WindowsTask, windows: Sequence[Window]
 ) -> Iterator[tuple[int, WindowPieces]]:
-    """Vectorize windows on workers; gives each one's number and pieces as they are done.
+    """Vectorize windows on workers that are started, or reached, for it.
 
     Args:
-        client: Of the cluster.
+        workers: Which.
         task: The map and how it is vectorized.
         windows: Of the map.
 
     Raises:
-        ClusterError: If workers died again and again on one window.
+        ClusterError: If there are none, or they died again and again on one window.
         HDMapError: Whatever a worker raised.
     """
+    # Not before: a map that is one window needs none.
+    with connected(workers) as client:
+        yield from _over(client, task, windows)
+
+
+def _over(
+    client: Client, task: WindowsTask, windows: Sequence[Window]
+) -> Iterator[tuple[int, WindowPieces]]:
     from distributed import wait
 
     waiting, doing = list(enumerate(windows)), dict[Any, int]()

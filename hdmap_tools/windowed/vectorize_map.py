@@ -11,6 +11,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -130,8 +131,9 @@ def vectorize_map(
     if windows[0].core is None or not local:
         return run(all_of_it(), plugins, seed=config.seed, failures=failures)
     crew = crew or partial(_in_this_process, semantic_map, local, config.seed)
+    place = semantic_map.location
     task = WindowsTask(
-        semantic_map.location,
+        place.absolute() if isinstance(place, Path) else place,
         semantic_map.history()[0].id,
         model,
         fill_radius_cells,
