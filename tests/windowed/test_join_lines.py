@@ -142,6 +142,24 @@ def test_what_one_window_alone_saw_whole_is_left_as_it_is():
     assert found == element
 
 
+def test_a_stretch_that_two_windows_see_apart_is_there_once():
+    window = list(windows())
+    west, east = window[CORES.index((0, 0))], window[CORES.index((1, 0))]
+    straight = line([(5.0, 20.0), (75.0, 20.0)])
+    bent = line([(5.0, 20.0), (36.0, 20.0), (38.0, 20.5), (42.0, 20.5), (44.0, 20.0), (75.0, 20.0)])
+    for first, second in ((straight, bent), (bent, straight)):
+        (found,) = join_lines([pieces_of([first], west), pieces_of([second], east)])
+        assert found.geometry.length == pytest.approx(70.0, abs=0.5)
+
+
+def test_a_line_seen_whole_after_a_part_of_it_is_whole():
+    window = list(windows())
+    west, east = window[CORES.index((0, 0))], window[CORES.index((1, 0))]
+    part, whole = line([(35.0, 20.0), (41.0, 20.0)]), line([(31.0, 20.0), (70.0, 20.0)])
+    (found,) = join_lines([pieces_of([part], west), pieces_of([whole], east)])
+    assert found.geometry.hausdorff_distance(whole.geometry) < 0.01
+
+
 def test_numbers_are_weighted_by_length_and_kinds_are_of_the_longest():
     window = list(windows())
     west, east = window[CORES.index((0, 0))], window[CORES.index((1, 0))]
