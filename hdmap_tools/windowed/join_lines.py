@@ -110,10 +110,21 @@ def _added(old: list[_Strand], new: list[_Strand]) -> list[_Strand]:
     may_turn = isinstance(new[0].parts[0][0], _UNDIRECTED)
     fresh = [strand.points for strand in new]
     found = runs_of(fresh, [strand.points for strand in old], may_turn=may_turn)
+    inside = {run.old for runs, one in zip(found, new, strict=True) for run in runs
+              if _is_covered(old[run.old], run) and one.length > old[run.old].length}  # fmt: skip
+    if inside:
+        # What one window saw all of stays as it is, without a change in its middle.
+        old = [strand for k, strand in enumerate(old) if k not in inside]
+        found = runs_of(fresh, [strand.points for strand in old], may_turn=may_turn)
     chain = _Chain(list(old))
     for strand, runs in zip(new, found, strict=True):
         _add_one(chain, strand, runs)
     return _assembled(chain)
+
+
+def _is_covered(strand: _Strand, run: Run) -> bool:
+    low, high = sorted(run.on_old)
+    return low <= _LEAST_NEW_M and high >= strand.length - _LEAST_NEW_M and high > low
 
 
 def _add_one(chain: _Chain, strand: _Strand, runs: list[Run]) -> None:
