@@ -307,11 +307,15 @@ class VectorizeConfig(_Step):
         vectorizers: Names; empty means all installed ones.
         options: Options by plugin name.
         seed: Seed of the generator each plugin is handed.
+        window_m: A map that has more cells than two windows of this side, with what plugins
+            must see around them, is vectorized in such windows, and their elements are put
+            together again. Made a whole number of tiles.
     """
 
     vectorizers: tuple[str, ...] = ()
     options: dict[str, dict[str, Any]] = Field(default_factory=dict)
     seed: int = 0
+    window_m: Annotated[float, Field(gt=0, le=10_000)] = 100.0
 
 
 class ExportConfig(_Step):

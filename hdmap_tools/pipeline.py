@@ -29,10 +29,11 @@ from hdmap_tools.segmentation.open_segmenter import find_model, open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
 from hdmap_tools.steps import Steps
 from hdmap_tools.types import NDArrayByte
-from hdmap_tools.vectorization import PluginFailure, choose, vectorize
+from hdmap_tools.vectorization import PluginFailure, choose
 from hdmap_tools.view.agreement import agreement_picture
 from hdmap_tools.view.image_overlay import project_window_into_image
 from hdmap_tools.view.overview import CameraPicture, Panel, known_bounds, overview_picture
+from hdmap_tools.windowed.vectorize_map import vectorize_map
 
 if TYPE_CHECKING:
     from hdmap_tools.map_model.vector_map import VectorMap
@@ -110,7 +111,13 @@ def run(
             windows = {method: whole_window(one, model, config) for method, one in maps.items()}
             window = windows[config.association.method]
         with steps.timed("vectorize"):
-            result = vectorize(window, config.vectorize)
+            result = vectorize_map(
+                made,
+                model,
+                config.vectorize,
+                fill_radius_cells=config.observation.fill_radius_cells,
+                whole=window,
+            )
         with steps.timed("export"):
             export(result.vector_map, folder, config)
         with steps.timed("compare"):

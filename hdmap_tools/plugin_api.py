@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -157,7 +157,12 @@ class Vectorizer(ABC):
         api_version: The plugin API it was written for.
         element_types: What it emits; anything else is refused.
         requires: Names of vectorizers whose elements it reads from ``upstream``.
-        halo_m: Context it needs beyond a window's edge, metres.
+        halo_m: How far from a place what it makes there may depend on the map, metres: a
+            large map is vectorized in windows that overlap by so much, and their elements are
+            put together again.
+        scope: ``window``; or ``map`` for one that must see the whole map and the finished
+            elements of those that it requires, such as one whose elements name others by id.
+            Such a one is shown the map in one piece, with the memory that this takes.
         Options: Typed options, with defaults.
     """
 
@@ -166,6 +171,7 @@ class Vectorizer(ABC):
     element_types: ClassVar[tuple[type[MapElement], ...]]
     requires: ClassVar[tuple[str, ...]] = ()
     halo_m: ClassVar[float] = 5.0
+    scope: ClassVar[Literal["window", "map"]] = "window"
     Options: type[VectorizerOptions] = VectorizerOptions
 
     @abstractmethod

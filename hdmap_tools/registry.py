@@ -182,6 +182,8 @@ def check_class(loaded: object, entry: PluginEntry) -> type[Vectorizer]:
         raise wrong(f"halo_m is {halo_m!r}", "metres, a number of 0 or more")
     if not (math.isfinite(halo_m) and halo_m >= 0):
         raise wrong(f"halo_m is {halo_m!r}", "metres, a finite number of 0 or more")
+    if loaded.scope not in ("window", "map"):
+        raise wrong(f"scope is {loaded.scope!r}", "'window' or 'map'")
     _check_options(loaded.Options, wrong)
     try:
         inspect.signature(loaded.vectorize).bind(None, None, None, None, rng=None)

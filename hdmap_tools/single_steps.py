@@ -4,34 +4,61 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from hdmap_tools.compare.raster import RasterComparison, compare_raster
 from hdmap_tools.compare.reference import load_reference
 from hdmap_tools.config import Config
+from hdmap_tools.distributed.cluster import Workers
+from hdmap_tools.distributed.vectorize import over_workers
 from hdmap_tools.errors import OutputExistsError
 from hdmap_tools.formats.gpkg import write_gpkg
 from hdmap_tools.fusion.map_location import MapLocation
 from hdmap_tools.fusion.semantic_map import SemanticMap
 from hdmap_tools.map_reading import model_for, whole_window
 from hdmap_tools.opening import open_configured
+from hdmap_tools.segmentation.cache import SegmentProgress
 from hdmap_tools.unfinished_map import map_when_done
-from hdmap_tools.vectorization import VectorizationResult, choose, vectorize
+from hdmap_tools.vectorization import VectorizationResult, choose
 from hdmap_tools.view.agreement import agreement_picture
+from hdmap_tools.windowed.vectorize_map import vectorize_map
 
 _LOG = logging.getLogger(__name__)
 
 
 def vectorize_alone(
-    map_path: MapLocation, out: Path, config: Config, *, overwrite: bool = False
+    map_path: MapLocation,
+    out: Path,
+    config: Config,
+    *,
+    overwrite: bool = False,
+    workers: Workers | None = None,
+    told: SegmentProgress | None = None,
 ) -> VectorizationResult:
-    """Vectorize a semantic map into a GeoPackage."""
+    """Vectorize a semantic map into a GeoPackage.
+
+    Args:
+        map_path: The map.
+        out: The file to make.
+        config: How the map is read and which plugins run.
+        overwrite: Replace an earlier file.
+        workers: Processes to spread a large map's windows over; None: this one does them.
+        told: After each window.
+    """
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists; use --overwrite to replace it.")
     choose(config.vectorize)  # what is wrong with the plugins asked for is said before any work
     semantic_map = SemanticMap.open(map_path)
-    window = whole_window(semantic_map, model_for(semantic_map.meta, config, semantic_map), config)
-    result = vectorize(window, config.vectorize)
+    model = model_for(semantic_map.meta, config, semantic_map)
+    result = vectorize_map(
+        semantic_map,
+        model,
+        config.vectorize,
+        fill_radius_cells=config.observation.fill_radius_cells,
+        crew=None if workers is None else partial(over_workers, workers),
+        told=told,
+    )
     write_gpkg(result.vector_map, out, overwrite=overwrite)
     return result
 

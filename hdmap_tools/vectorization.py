@@ -25,6 +25,7 @@ from hdmap_tools import registry
 from hdmap_tools.config import VectorizeConfig
 from hdmap_tools.errors import ConfigError, PluginError, PluginFailedError, ShapeError
 from hdmap_tools.geometry.grid import BevGrid
+from hdmap_tools.geometry.map_frame import MapFrame
 from hdmap_tools.map_model.elements import MapElement
 from hdmap_tools.map_model.vector_map import VectorMap, with_stable_ids
 from hdmap_tools.plugin_api import API_VERSION, MapWindow, Vectorizer, VectorizerOptions
@@ -198,6 +199,23 @@ def check_options(
         ) from error
 
 
+@dataclass(frozen=True)
+class PluginRuns:
+    """What vectorizers made of one window.
+
+    Attributes:
+        elements: By vectorizer, in the order in which they ran; each with an id.
+        returned: The same, with the ids that the vectorizers themselves gave, if any.
+        records: What the provenance says of each that worked.
+        failures: Sorted by name.
+    """
+
+    elements: dict[str, tuple[MapElement, ...]]
+    returned: dict[str, tuple[MapElement, ...]]
+    records: tuple[dict[str, Any], ...]
+    failures: tuple[PluginFailure, ...]
+
+
 def run(
     window: MapWindow,
     plugins: Sequence[LoadedPlugin],
@@ -214,12 +232,55 @@ def run(
             does not matter which others run.
         failures: What failed before; dependants of these are skipped.
     """
+    runs = run_plugins(window, plugins, seed=seed, failures=failures)
+    return result_of(runs, window.frame, seed)
+
+
+def result_of(
+    runs: PluginRuns, frame: MapFrame, seed: int, more: Mapping[str, Any] | None = None
+) -> VectorizationResult:
+    """The map of what vectorizers made.
+
+    Args:
+        runs: Of all vectorizers.
+        frame: Of the elements.
+        seed: That they ran with.
+        more: Of the provenance.
+    """
+    provenance = {
+        "plugin_api": API_VERSION,
+        "seed": seed,
+        "plugins": sorted(runs.records, key=lambda record: str(record["name"])),
+        "failed": [{"name": failure.name, "message": failure.message} for failure in runs.failures],
+    } | dict(more or {})
+    elements = tuple(element for part in runs.elements.values() for element in part)
+    return VectorizationResult(VectorMap(frame, elements, provenance), runs.failures)
+
+
+def run_plugins(
+    window: MapWindow,
+    plugins: Sequence[LoadedPlugin],
+    *,
+    seed: int = 0,
+    failures: Sequence[PluginFailure] = (),
+    before: Mapping[str, tuple[MapElement, ...]] | None = None,
+) -> PluginRuns:
+    """Run loaded vectorizers, required ones first.
+
+    Args:
+        window: The map.
+        plugins: In an order in which the required ones come first, as `choose` gives.
+        seed: See `run`.
+        failures: What failed before; dependants of these are skipped.
+        before: Elements that were made before, by vectorizer.
+    """
     _check_window(window)
     window = read_only(window)
     failed = {failure.name: failure for failure in failures}
-    made: dict[str, tuple[MapElement, ...]] = {}
+    made = dict(before or {})
+    returned: dict[str, tuple[MapElement, ...]] = {}
     ran: list[dict[str, Any]] = []
-    taken: set[str] = set()
+    taken = {element.id for elements in made.values() for element in elements}
     for plugin in plugins:
         name = plugin.entry.name
         lost = [required for required in plugin.vectorizer.requires if required not in made]
@@ -236,8 +297,8 @@ def run(
         started_s = time.perf_counter()
         try:
             record = _record(plugin)
-            returned = run_one(plugin, window, upstream, seed=seed)
-            made[name] = _with_origin(returned, plugin.entry, taken)
+            signed = _signed(run_one(plugin, window, upstream, seed=seed), plugin.entry, taken)
+            made[name], returned[name] = with_stable_ids(signed, taken=taken), signed
         # KeyboardInterrupt passes; sys.exit() in a plugin must not end the run.
         except (Exception, SystemExit) as error:
             reason = str(error) if isinstance(error, PluginFailedError) else _summary(error)
@@ -253,15 +314,7 @@ def run(
             len(made[name]),
             time.perf_counter() - started_s,
         )
-    ordered = tuple(failed[name] for name in sorted(failed))
-    provenance = {
-        "plugin_api": API_VERSION,
-        "seed": seed,
-        "plugins": sorted(ran, key=lambda record: str(record["name"])),
-        "failed": [{"name": failure.name, "message": failure.message} for failure in ordered],
-    }
-    elements = tuple(element for part in made.values() for element in part)
-    return VectorizationResult(VectorMap(window.frame, elements, provenance), ordered)
+    return PluginRuns(made, returned, tuple(ran), tuple(failed[name] for name in sorted(failed)))
 
 
 def run_one(
@@ -350,7 +403,7 @@ def check_elements(
     return returned
 
 
-def _with_origin(
+def _signed(
     returned: Sequence[MapElement], entry: PluginEntry, taken: set[str]
 ) -> tuple[MapElement, ...]:
     clash = sorted(element.id for element in returned if element.id in taken)[:3]
@@ -358,11 +411,10 @@ def _with_origin(
         raise PluginFailedError(
             f"Ids {clash} belong to elements of another vectorizer; leave id empty."
         )
-    signed = [
+    return tuple(
         element.model_copy(update={"plugin": entry.name, "plugin_version": entry.version})
         for element in returned
-    ]
-    return with_stable_ids(signed, taken=taken)
+    )
 
 
 def _record(plugin: LoadedPlugin) -> dict[str, Any]:

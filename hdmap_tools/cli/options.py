@@ -199,7 +199,7 @@ def worker_options(shared: str, more: str = "") -> Callable[[F], F]:
             click.option(
                 "--workers",
                 type=click.IntRange(min=1),
-                help="Spread the drive over so many processes of this machine.",
+                help="Spread the work over so many processes of this machine.",
             ),
         ):
             function = option(function)
@@ -283,6 +283,7 @@ _FIELD_OF_OPTION: Final = {
     "resolution": "fusion.resolution_m",
     "confusion": "observation.confusion",
     "vectorizers": "vectorize.vectorizers",
+    "window": "vectorize.window_m",
     "reference": "compare.reference",
     "max_range": "compare.max_range_m",
 }

@@ -14,24 +14,41 @@ from hdmap_tools.cli import options
 @click.option("-o", "--out", type=options.PATH, required=True, help="GeoPackage to make.")
 @options.vectorizer_option
 @options.confusion_option
+@click.option(
+    "--window",
+    type=float,
+    help="Side of the windows that a large map is vectorized in, metres [default: 100].",
+)
+@options.worker_options("the map", "; a map in S3 with the same environment")
 @options.overwrite_option
 @options.json_option
 @options.config_options
-def command(**given: Any) -> int:
+@click.pass_context
+def command(ctx: click.Context, /, **given: Any) -> int:
     """Run vectorizer plugins over a semantic map.
 
     \b
     Examples:
       hdmap vectorize out/semantic_map -o features.gpkg
       hdmap vectorize map -o marks.gpkg --vectorizer lane_mark_skeleton
+      hdmap vectorize city -o city.gpkg --workers 8
+
+    A map that is larger than two windows with what plugins must see around them is vectorized
+    window by window, and lines and areas that cross a seam are put together again.
     """
     from hdmap_tools.cli.main import EXIT_PLUGIN_FAILED
     from hdmap_tools.single_steps import vectorize_alone
 
     config = options.resolve_config(given)
-    result = vectorize_alone(
-        given["semantic_map"], given["out"], config, overwrite=given["overwrite"]
-    )
+    with options.ImageProgress(ctx.obj["progress"], "windows") as told:
+        result = vectorize_alone(
+            given["semantic_map"],
+            given["out"],
+            config,
+            overwrite=given["overwrite"],
+            workers=options.workers_of(given),
+            told=told,
+        )
     counts = result.vector_map.counts()
     options.write_json(
         given["json_path"],

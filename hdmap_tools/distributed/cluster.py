@@ -49,7 +49,7 @@ def connected(workers: Workers) -> Iterator[Client]:
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise MissingExtraError(
-            "Spreading a build needs Dask: pip install 'hdmap_tools[distributed]'."
+            "Spreading work over processes needs Dask: pip install 'hdmap_tools[distributed]'."
         ) from error
     # Workers that come and go are reported as errors of the build, if they are any.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
@@ -147,6 +147,6 @@ def deaths_explained(kept: str) -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise ClusterError(
-            "Workers died again and again on one part of the drive; most often they run out of "
+            "Workers died again and again on one part of the work; most often they run out of "
             f"memory: give each more, or take fewer (--workers). {kept}"
         ) from error

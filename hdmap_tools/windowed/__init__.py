@@ -1,0 +1,1 @@
+"""Vectorizing a map window by window: in bounded memory, the seams invisible."""
