@@ -61,7 +61,7 @@ def connected(workers: Workers) -> Iterator[Client]:
                 threads_per_worker=1,
                 processes=True,
                 memory_limit=workers.memory or "auto",
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # the usual port may be another build's
                 silence_logs=logging.ERROR,
             )
             yield stack.enter_context(Client(stack.enter_context(cluster)))

@@ -5,6 +5,7 @@ import socket
 
 import pytest
 
+from hdmap_tools.distributed.cluster import Workers, connected
 from hdmap_tools.fusion.semantic_map import SemanticMap
 
 from .conftest import LABELS
@@ -96,3 +97,17 @@ def test_a_worker_without_enough_memory(street, hdmap, fails, whole):
     code, _, err = hdmap(*BUILD, "-o", "map")
     assert code == 0, err
     assert SemanticMap.open(street / "map").read().equals(whole.read())
+
+
+def test_two_clusters_on_one_machine_are_do_not_meet():
+    # The second would be told that the port of the first one's pages is taken; and all is for this machine alone.
+    with connected(Workers(1)) as one, connected(Workers(1)) as other:
+        assert one.submit(abs, -1).result() == other.submit(abs, -1).result() == 1
+        processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        addresses = {
+            listening.laddr.ip
+            for process in processes
+            for listening in process.net_connections()
+            if listening.status == psutil.CONN_LISTEN
+        }
+    assert addresses == {"127.0.0.1"}
