@@ -99,7 +99,7 @@ def test_a_worker_without_enough_memory(street, hdmap, fails, whole):
     assert SemanticMap.open(street / "map").read().equals(whole.read())
 
 
-def test_two_clusters_on_one_machine_are_do_not_meet():
+def test_two_clusters_on_one_machine_do_not_meet():
     # The second would be told that the port of the first one's pages is taken; and all is for this machine alone.
     with connected(Workers(1)) as one, connected(Workers(1)) as other:
         assert one.submit(abs, -1).result() == other.submit(abs, -1).result() == 1
