@@ -14,7 +14,12 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
 from hdmap_tools.distributed.cluster import deaths_explained, listening, queue_length, teller
-from hdmap_tools.distributed.count_segment import SegmentCounts, SegmentTask, count_segment
+from hdmap_tools.distributed.count_segment import (
+    SeenCells,
+    SegmentCounts,
+    SegmentTask,
+    count_segment,
+)
 from hdmap_tools.frame_source import FrameCounts
 from hdmap_tools.fusion.cell_counts import TileIndex
 from hdmap_tools.fusion.map_store import add_to_tile
@@ -114,7 +119,7 @@ def _write(
     def write(fork: Any) -> list[Any]:
         submit = partial(client.submit, priority=_AT_ONCE)
         tasks = [
-            submit(_add_tile, fork, index, *[submit(_tile, part, index) for part in parts])
+            submit(_add_tile, fork, index, *[submit(_seen_cells, part, index) for part in parts])
             for index, parts in sorted(holders.items())
         ]
         return list(client.gather(tasks))
@@ -127,10 +132,10 @@ def _write(
     )
 
 
-def _tile(counts: SegmentCounts, index: TileIndex) -> Any:
+def _seen_cells(counts: SegmentCounts, index: TileIndex) -> SeenCells:
     return counts.tiles[index]
 
 
-def _add_tile(fork: Any, index: TileIndex, *parts: Any) -> Any:
-    add_to_tile(fork, index, parts)
+def _add_tile(fork: Any, index: TileIndex, *parts: SeenCells) -> Any:
+    add_to_tile(fork, index, (part.tile() for part in parts))
     return fork

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from hdmap_tools.config import Config
 from hdmap_tools.frame_source import FrameCounts, FrameSource
 from hdmap_tools.fusion.cell_counts import CellCounts, Tile, TileIndex
@@ -18,6 +20,7 @@ from hdmap_tools.readers.drive import Drive, ImageRef
 from hdmap_tools.segmentation.cache import LabelCache, segment_drive
 from hdmap_tools.segmentation.open_segmenter import open_segmenter
 from hdmap_tools.segmentation.segmenter import Segmenter
+from hdmap_tools.types import NDArrayAny, NDArrayInt
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,34 @@ class SegmentTask:
 
 
 @dataclass(frozen=True)
+class SeenCells:
+    """The cells of a tile that hold evidence, which are a small part of it: what is sent of it.
+
+    Attributes:
+        cells: (K,) flat cells of the tile.
+        layers: By name, (K,) or, of ``counts``, (label, bin, K).
+    """
+
+    cells: NDArrayInt
+    layers: dict[str, NDArrayAny]
+
+    @classmethod
+    def of(cls, tile: Tile) -> SeenCells:
+        """Of a tile; a height comes with every observation."""
+        cells = np.flatnonzero(tile.layers["height_n"])
+        flat = {name: layer.reshape(*layer.shape[:-2], -1) for name, layer in tile.layers.items()}
+        return cls(cells, {name: layer[..., cells] for name, layer in flat.items()})
+
+    def tile(self) -> Tile:
+        """The tile."""
+        num_labels, num_bins = self.layers["counts"].shape[:2]
+        whole = Tile.zeros(num_labels, num_bins)
+        for name, layer in whole.layers.items():
+            layer.reshape(*layer.shape[:-2], -1)[..., self.cells] = self.layers[name]
+        return whole
+
+
+@dataclass(frozen=True)
 class SegmentCounts:
     """What a segment adds to a map.
 
@@ -72,7 +103,7 @@ class SegmentCounts:
     number: int
     num_frames: int
     observations: dict[str, int]
-    tiles: dict[TileIndex, Tile]
+    tiles: dict[TileIndex, SeenCells]
 
 
 def count_segment(
@@ -98,7 +129,7 @@ def count_segment(
     labelled = segment_drive(drive, segmenter, some, cache, progress)
     # A worker is given one core.
     count_images(source, labelled, {source.methods[0]: counts}, frames, ahead=False)
-    tiles = {index: tile for index, tile in counts.tiles.items() if not tile.is_empty}
+    tiles = {i: SeenCells.of(tile) for i, tile in counts.tiles.items() if not tile.is_empty}
     return SegmentCounts(number, counts.num_frames, dict(frames.observations), tiles)
 
 
