@@ -278,7 +278,7 @@ def test_a_full_disk(street, fails, monkeypatch):
 
 
 def test_a_bug_is_called_a_bug(street, fails, monkeypatch):
-    monkeypatch.setattr("hdmap_tools.pipeline.vectorize", lambda *_: 1 / 0)
+    monkeypatch.setattr("hdmap_tools.pipeline.vectorize_map", lambda *_, **__: 1 / 0)
     fails(*RUN, says=("Unexpected ZeroDivisionError", "-vv"))
     with pytest.raises(ZeroDivisionError):
         main(["-vv", *RUN])
