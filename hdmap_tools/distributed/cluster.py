@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from hdmap_tools.errors import ClusterError, MissingExtraError
 
 if TYPE_CHECKING:
     from distributed import Client
+
+_Made = TypeVar("_Made")
 
 _PROGRESS: Final = "hdmap-progress"
 _ANSWERS_WITHIN_S: Final = 20.0
@@ -102,6 +104,32 @@ def num_threads(client: Client) -> int:
 def queue_length(client: Client) -> int:
     """Tasks to have submitted: for each worker one at work, and two that wait while others are dealt with."""
     return _AHEAD * max(1, len(client.scheduler_info()["workers"]))
+
+
+def as_they_get_done(
+    client: Client, function: Callable[..., _Made], items: Iterable[tuple[Any, ...]]
+) -> Iterator[_Made]:
+    """What ``function(*item)`` gives for each item, computed on the workers, a few items ahead.
+
+    Raises:
+        HDMapError: Whatever a worker raised; what was submitted is then given up.
+    """
+    from distributed import wait
+
+    source, doing = iter(items), set[Any]()
+    try:
+        while True:
+            room = queue_length(client)
+            while len(doing) < room and (item := next(source, None)) is not None:
+                doing.add(client.submit(function, *item, pure=False))
+            if not doing:
+                return
+            done = wait(doing, return_when="FIRST_COMPLETED").done
+            doing -= done
+            for future in done:
+                yield future.result()
+    finally:
+        client.cancel(list(doing))
 
 
 @contextmanager

@@ -19,10 +19,10 @@ import numpy as np
 
 from hdmap_tools.config import Config
 from hdmap_tools.distributed.cluster import (
+    as_they_get_done,
     deaths_explained,
     listening,
     num_threads,
-    queue_length,
     teller,
 )
 from hdmap_tools.errors import ClusterError
@@ -123,22 +123,8 @@ class _Spread:
     def _each(
         self, step: Callable[..., _Made], items: Iterable[tuple[Any, ...]]
     ) -> Iterator[_Made]:
-        from distributed import wait
-
-        source, doing = iter(items), set[Any]()
-        try:
-            while True:
-                room = queue_length(self.client)
-                while len(doing) < room and (item := next(source, None)) is not None:
-                    doing.add(self.client.submit(_do, self.task, step, item, pure=False))
-                if not doing:
-                    return
-                done = wait(doing, return_when="FIRST_COMPLETED").done
-                doing -= done
-                for future in done:
-                    yield future.result()
-        finally:
-            self.client.cancel(list(doing))
+        given = ((self.task, step, item) for item in items)
+        return as_they_get_done(self.client, _do, given)
 
 
 def _do(task: PointsTask, step: Callable[..., _Made], item: tuple[Any, ...]) -> _Made:

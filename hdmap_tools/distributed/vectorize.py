@@ -8,14 +8,10 @@ to be done again because its worker died.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
 
-from hdmap_tools.distributed.cluster import Workers, connected, deaths_explained, queue_length
+from hdmap_tools.distributed.cluster import Workers, as_they_get_done, connected, deaths_explained
 from hdmap_tools.windowed.vectorize_map import WindowPieces, WindowsTask, vectorize_window
 from hdmap_tools.windowed.windows import Window
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 
 def over_workers(
@@ -33,24 +29,10 @@ def over_workers(
         HDMapError: Whatever a worker raised.
     """
     # Not before: a map that is one window needs none.
-    with connected(workers) as client:
-        yield from _over(client, task, windows)
+    with connected(workers) as client, deaths_explained("Nothing was written."):
+        given = ((task, number, window) for number, window in enumerate(windows))
+        yield from as_they_get_done(client, _vectorize, given)
 
 
-def _over(
-    client: Client, task: WindowsTask, windows: Sequence[Window]
-) -> Iterator[tuple[int, WindowPieces]]:
-    from distributed import wait
-
-    waiting, doing = list(enumerate(windows)), dict[Any, int]()
-    try:
-        with deaths_explained("Nothing was written."):
-            while waiting or doing:
-                room = queue_length(client)
-                while waiting and len(doing) < room:
-                    number, window = waiting.pop(0)
-                    doing[client.submit(vectorize_window, task, window, pure=False)] = number
-                for future in wait(list(doing), return_when="FIRST_COMPLETED").done:
-                    yield doing.pop(future), future.result()
-    finally:
-        client.cancel(list(doing))
+def _vectorize(task: WindowsTask, number: int, window: Window) -> tuple[int, WindowPieces]:
+    return number, vectorize_window(task, window)

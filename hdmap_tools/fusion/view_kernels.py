@@ -93,6 +93,27 @@ def view_at(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _within(
+    planes: NDArrayFloat, y0: float, y1: float, z_range: tuple[float, float], wholly: bool
+) -> tuple[float, float]:
+    """From where to where along x a row of cells may lie within half spaces, or does so wholly."""
+    low, high = -np.inf, np.inf
+    for p in range(len(planes)):
+        a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
+        if wholly:
+            rest = min(b * y0, b * y1) + min(c * z_range[0], c * z_range[1]) + d - _SLACK
+        else:
+            rest = max(b * y0, b * y1) + max(c * z_range[0], c * z_range[1]) + d + _SLACK
+        if a > 1e-9:
+            low = max(low, -rest / a)
+        elif a < -1e-9:
+            high = min(high, -rest / a)
+        elif rest < 0.0:
+            high = -np.inf
+    return low, high
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _rows_in_view(
     planes: NDArrayFloat,
     inner_planes: NDArrayFloat,
@@ -123,16 +144,7 @@ def _rows_in_view(
         if first == last:
             continue
         y0, y1 = row * resolution_m, (row + 1) * resolution_m
-        low, high = -np.inf, np.inf
-        for p in range(len(planes)):
-            a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
-            rest = max(b * y0, b * y1) + max(c * z_range[0], c * z_range[1]) + d + _SLACK
-            if a > 1e-9:
-                low = max(low, -rest / a)
-            elif a < -1e-9:
-                high = min(high, -rest / a)
-            elif rest < 0.0:
-                high = -np.inf
+        low, high = _within(planes, y0, y1, z_range, False)
         if low > high:
             continue
         low, high = np.floor(low / resolution_m) - 1.0, np.floor(high / resolution_m) + 1.0
@@ -140,17 +152,9 @@ def _rows_in_view(
             first += 1
         while last > first and columns[last - 1] > high:
             last -= 1
-        low, high = -np.inf, (np.inf if len(inner_planes) else -np.inf)
-        for p in range(len(inner_planes)):
-            a, b = inner_planes[p, 0], inner_planes[p, 1]
-            c, d = inner_planes[p, 2], inner_planes[p, 3]
-            rest = min(b * y0, b * y1) + min(c * z_range[0], c * z_range[1]) + d - _SLACK
-            if a > 1e-9:
-                low = max(low, -rest / a)
-            elif a < -1e-9:
-                high = min(high, -rest / a)
-            elif rest < 0.0:
-                high = -np.inf
+        low, high = -np.inf, -np.inf
+        if len(inner_planes):
+            low, high = _within(inner_planes, y0, y1, z_range, True)
         low, high = np.ceil(low / resolution_m), np.floor(high / resolution_m) - 1.0
         inner_first, inner_last = first, last
         while inner_first < last and columns[inner_first] < low:
